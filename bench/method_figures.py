@@ -22,7 +22,7 @@ from endoprior.core.geometry import project
 from endoprior.data import FrameSequence
 from endoprior.model.scene import Scene
 from endoprior.priors import joint_texture_prior, salience, specular_likelihood
-from endoprior.training.temporal import motion_weight
+from endoprior.training.temporal import MOTION_TEMPERATURE, MOTION_THRESHOLD, motion_weight
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.visualization.camera_paths import turned
@@ -91,11 +91,11 @@ def gaussians(scene: Scene, sequence: FrameSequence) -> None:
 
 def temporal(scene: Scene) -> None:
     """The motion weight over the score, and where the Gaussians with a high weight are."""
-    cfg, score = scene.config.temporal, scene.prior_score.numpy()
-    weights = motion_weight(score, cfg.motion_threshold, cfg.motion_temperature)
+    score = scene.prior_score.numpy()
+    weights = motion_weight(score, MOTION_THRESHOLD, MOTION_TEMPERATURE)
     result, axes = figure(2, 2.9, [1, 1.35])
     line = np.linspace(0, 1, 200)
-    axes[0].plot(line, motion_weight(line, cfg.motion_threshold, cfg.motion_temperature), color="tab:red")
+    axes[0].plot(line, motion_weight(line, MOTION_THRESHOLD, MOTION_TEMPERATURE), color="tab:red")
     axes[0].hist(score, 50, range=(0, 1), weights=np.full(len(score), 5 / len(score)), color="tab:gray", alpha=0.5)
     axes[0].set_ylim(0, 1.05)
     axes[0].set_xlabel("texture-prior score $s$ (gray: its histogram)")

@@ -22,6 +22,7 @@ from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer, motion_rates, rate_of
+from endoprior.training.temporal import MOST_POINTS
 from endoprior_baselines.time_network import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
 TIME, RATE, EPSILON = 0.4, 1e-3, 1e-15
@@ -39,7 +40,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
             measured += common.rows(name, common.race(steps(num, NUMBA), steps(num, TORCH)), num)
         result = common.race(network(num, relu_network), network(num, relu_network_torch))
         measured += common.rows("network of 8 x 256", result, num)
-    for num in sorted({preset("default").temporal.max_points, *common.nums(sizes)}):
+    for num in sorted({MOST_POINTS, *common.nums(sizes)}):
         other = temporal(num, TORCH) if num <= TORCH_MOST_PAIRS else None
         measured += common.rows("temporal term", common.race(temporal(num, NUMBA), other), num)
     for picture in common.pictures(sizes):
@@ -54,7 +55,7 @@ def hexplane(num: int, ops: TrainingOps) -> common.Steps:
     field = HexPlaneField.from_points(points, DeformationConfig(), generator)
     box, trunk, adam = field.box.detach(), field.heads.trunk, PlaneAdam(field.grid, EPSILON)
     unit = ((points - box[0]) / (box[1] - box[0])).requires_grad_()
-    cotangent = torch.randn(num, field.cfg.hexplane.width, generator=generator)
+    cotangent = torch.randn(num, field.width, generator=generator)
 
     def forward(time: float) -> torch.Tensor:
         (out,) = ops.model.hexplane_linear(field.grid, unit, (time,), *trunk)
@@ -124,11 +125,11 @@ def optimizer(num: int, ops: TrainingOps) -> common.Steps:
 
 def temporal(num: int, ops: TrainingOps) -> common.Steps:
     """The temporal term and its gradient: neighbors, pair weights, Eq. (11)."""
-    cfg, before = preset("default").temporal, scenes.sheet(num)
+    before = scenes.sheet(num)
     generator = torch.Generator().manual_seed(1)
     now = (before + 0.1 * torch.randn(num, 3, generator=generator)).requires_grad_()
     weights = torch.from_numpy(np.ones(num))
-    return {"": lambda _: torch.autograd.grad(sum(ops.local_consistency(now, before, weights, cfg)), now)}
+    return {"": lambda _: torch.autograd.grad(sum(ops.local_consistency(now, before, weights)), now)}
 
 
 def losses(width: int, height: int, ops: TrainingOps) -> common.Steps:

@@ -22,11 +22,12 @@ def read(path):
 
 def basis_offsets(arrays, about, t):
     cfg, motion = about["config"]["deformation"], arrays["gaussians.motion"]
-    d = (t - np.linspace(0, 1, motion.shape[1])) / (cfg["basis"]["relative_width"] / motion.shape[1])
+    d = (t - np.linspace(0, 1, motion.shape[1])) / (cfg["basis"].get("relative_width", 1.5) / motion.shape[1])
     e = np.exp(-4.5)
     total = np.einsum("b,nbc->nc", np.maximum(0, (np.exp(-(d**2) / 2) - e) / (1 - e)), motion)
-    widths = {"means": 3, "quats": 4 * cfg["deform_quats"], "log_scales": 3 * cfg["deform_scales"]}
-    widths |= {"opacity_logits": 1 * cfg["deform_opacity"], "sh_dc": 3 * cfg["basis"]["deform_color"]}
+    turns, grows = (cfg.get(name, cfg.get("deform_shape")) for name in ("deform_quats", "deform_scales"))
+    widths = {"means": 3, "quats": 4 * turns, "log_scales": 3 * grows}
+    widths |= {"opacity_logits": 1 * cfg["deform_opacity"], "sh_dc": 3 * cfg["basis"].get("deform_color", True)}
     ends = np.cumsum(list(widths.values()))
     return {name: total[:, end - width : end] for (name, width), end in zip(widths.items(), ends, strict=True) if width}
 
@@ -51,7 +52,7 @@ def hexplane_offsets(arrays, about, t):
     first, second = field["hexplane.box"]
     u = (arrays["gaussians.means"] - first) / (second - first)
     where = {"x": u[:, 0], "y": u[:, 1], "z": u[:, 2]}
-    where["t"] = np.full(len(u), t if cfg["time_map"] == "full" else (t + 1) / 2)
+    where["t"] = np.full(len(u), t if cfg.get("time_map") == "full" else (t + 1) / 2)
     features = []
     for scale in range(len(cfg["multires"])):
         product = 1

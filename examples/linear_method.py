@@ -2,10 +2,11 @@
 
 from torch import Tensor
 
-from endoprior.core.config import Config, DensityConfig, ScheduleConfig, TemporalConfig
+from endoprior.core.config import Config
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Field, Motion, Offsets
 from endoprior.model.ops import ModelOps
+from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate
@@ -55,9 +56,12 @@ METHOD = LinearMethod()
 
 def config() -> Config:
     """What `--preset linear` starts from."""
-    return Config(
-        method="linear",
-        temporal=TemporalConfig(weight=0.0),
-        density=DensityConfig(min_densify_weight=1.0, prior_prune=False),
-        schedule=ScheduleConfig(coarse_iterations=0, fine_iterations=1500),
+    return paper().replace(
+        {
+            "method": "linear",
+            "temporal.weight": 0.0,
+            "density.min_densify_weight": 1.0,
+            "schedule.coarse_iterations": 0,
+            "schedule.fine_iterations": 1500,
+        }
     )

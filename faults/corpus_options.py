@@ -34,31 +34,26 @@ VALUES = {
         "--data.shrink": ("0", "-1", "1000"),
         "--data.first-frames": ("-1", LONG),
         "--data.depth-unit-mm": ("nan", "inf", "-1", "1e300"),
-        "--data.depth-clip-low-percentile": ("nan", "101"),
-    },
-    ("prior data out", "sequence"): {
-        **dict.fromkeys(("--specular.value-threshold", "--specular.value-temperature"), ("nan", "inf")),
-        "--salience.percentile": ("nan", "101"),
     },
     ("train data out", "sequence"): {
         **dict.fromkeys(
             (
                 *("--init.opacity", "--loss.depth-weight", "--optim.means-lr", "--density.grow-threshold"),
-                *("--temporal.huber-delta", "--deformation.basis.relative-width", "--temporal.weight"),
+                *("--optim.basis-lr", "--released.prune-max-scale-mm", "--temporal.weight"),
             ),
             ("nan",),
         ),
         **dict.fromkeys(
             (
-                *("--init.budget", "--init.voxel-divisions", "--deformation.hexplane.channels"),
-                *("--deformation.basis.num-bases", "--density.max-gaussians", "--temporal.num-neighbors"),
+                *("--init.budget", "--schedule.fine-iterations", "--deformation.hexplane.channels"),
+                *("--deformation.basis.num-bases", "--density.every", "--temporal.min-points"),
             ),
             (HUGE + "000",),
         ),
         **dict.fromkeys(
             (
-                *("--seed", "--init.erosion-px", "--init.outlier-neighbors", "--optim.epsilon"),
-                *("--schedule.sh-every", "--density.split-shrink"),
+                *("--seed", "--init.thickness", "--windows.longest", "--density.prune-opacity"),
+                *("--schedule.sh-every", "--optim.late-decay"),
             ),
             ("-1",),
         ),

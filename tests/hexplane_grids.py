@@ -11,7 +11,13 @@ from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.model.hexplane import PlaneGrid
 from endoprior.model.hexplane_numba import hexplane_linear
 
-SMALL = HexPlaneConfig(resolution=(5, 4, 6), time_resolution=7, channels=20, multires=(1, 3))
+
+def planes(resolution: tuple[int, int, int], *values: int | tuple[int, ...]) -> HexPlaneConfig:
+    """A config with other cells along x, y, z, which are 64 else; `values` are those of its fields."""
+    return type("Planes", (HexPlaneConfig,), {"resolution": resolution})(*values)
+
+
+SMALL = planes((5, 4, 6), 7, 20, (1, 3))
 
 
 def random_grid(cfg: HexPlaneConfig = SMALL, seed: int = 0) -> PlaneGrid:

@@ -18,7 +18,7 @@ needs_ray = pytest.mark.skipif(
 
 def in_windows(fine: int) -> Config:
     """Quick training, in three windows for 20 frames."""
-    windows = WindowConfig(enabled=True, shortest=6, longest=10, overlap=3)
+    windows = WindowConfig(longest=10)
     return replace(tiny_config("basis", fine=fine), windows=windows)
 
 

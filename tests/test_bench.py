@@ -151,7 +151,7 @@ def test_plain_torch_draws_the_same_picture_with_the_same_gradients():
 @pytest.mark.parametrize("name", ["default", pytest.param("paper", marks=pytest.mark.slow)])
 def test_plain_torch_trains_on_the_same_terms(make_tiny_sequence, name):
     cfg = iteration.config(name, 300)
-    planes = replace(cfg.deformation.hexplane, resolution=(8, 8, 8), time_resolution=6, channels=4, multires=(1, 2))
+    planes = replace(cfg.deformation.hexplane, time_resolution=6, channels=4, multires=(1, 2))
     cfg = replace(
         cfg,
         deformation=replace(cfg.deformation, hexplane=planes),

@@ -107,7 +107,7 @@ def test_bad_matches_are_named(tmp_path, match, said):
 
 
 def test_a_benchmark_trains_with_what_it_finds(tmp_path):
-    events = {"density.start_iteration": 2, "density.every": 2, "density.extent_mode": "scene"}
+    events = {"density.start_iteration": 2, "density.every": 2}
     planes = {"deformation.hexplane.channels": 8, "deformation.hexplane.multires": [1]}
     values = {
         "title": "t",

@@ -162,7 +162,7 @@ def test_toml_says_the_same(tmp_path):
         ({"methods": {"m": {"preset": "finest"}}}, "methods.m.preset: expected one of default"),
         ({"methods": {"m": {"set": {"init": 3}}}}, "methods.m.set: expected the name of a config field"),
         ({"methods": {"m": {"set": {"init.bugdet": 3}}}}, "methods.m.set: expected the name of a config field"),
-        ({"methods": {"m": {"set": {"init.erosion_px": "big"}}}}, "methods.m.init.erosion_px: expected an integer"),
+        ({"methods": {"m": {"set": {"density.every": "big"}}}}, "methods.m.density.every: expected an integer"),
         ({"set_for": {"finest": {}}}, "set_for: expected one of default"),
         ({"extends": "spec.yaml"}, "`extends` a list of files"),
         ({"set": {"density.min_densify_weight": 3.0}}, "min_densify_weight must be in"),
@@ -228,12 +228,11 @@ def test_scared_has_the_settings_published_for_it():
     assert numbers == [1, 2, 3, 6, 7], "the stride follows from the folder's name"
     published = {
         "deformation.hexplane.channels": 32,
-        "deformation.deform_scales": False,
-        "deformation.deform_quats": False,
+        "deformation.deform_shape": False,
     }
     shorter = published | {"schedule.fine_iterations": 2000, "optim.decay_iterations": 2000}
     # The release trains as long as on EndoNeRF, does not clean up, and its pixels and principal point agree.
-    released = published | {"init.cleanup": False, "init.pixel_offset": "exact"}
+    released = published | {"released.cleanup": False, "released.half_pixel_shift": False}
     for method, changes in (("endogaussian", shorter), ("paper", shorter), ("released", released), ("default", {})):
         found = spec.config(method, "d1", None, 0)
         assert found == replace(preset(method).replace(changes), data=found.data)
@@ -243,12 +242,12 @@ def test_scared_has_the_settings_published_for_it():
 @pytest.mark.parametrize("size", ["full", "sized"])
 def test_depth_flags_change_the_flags_and_nothing_else(size):
     spec = load_spec(find_spec(f"{size}/depth_flags"))
-    flags = {"kept": (False, "legacy"), "centers": (True, "exact"), "both": (False, "exact")}
-    for base, changes in (("endogaussian", flags), ("paper", {"paper_flags": (True, "legacy")})):
+    flags = {"kept": (False, True), "centers": (True, False), "both": (False, False)}
+    for base, changes in (("endogaussian", flags), ("paper", {"paper_flags": (True, True)})):
         for method, (lifted, offset) in changes.items():
             for sequence in spec.sequences:
                 want = spec.config(base, sequence, None, 0).replace(
-                    {"data.lift_missing_depth": lifted, "init.pixel_offset": offset}
+                    {"data.lift_missing_depth": lifted, "released.half_pixel_shift": offset}
                 )
                 assert spec.config(method, sequence, None, 0) == want != spec.config(base, sequence, None, 0)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from export_scenes import moving_scene
+from hexplane_grids import planes
 
-from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.model.carry import NUM_CARRIERS, carry, carry_points, confidence_of
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.hexplane_field import HexPlaneField
@@ -135,7 +135,7 @@ def test_pixels_on_the_border_and_beyond():
 
 def test_a_hexplane_scene_carries_points_with_its_gaussians():
     cfg = preset("paper").fitted(20)
-    hexplane = HexPlaneConfig(resolution=(5, 6, 7), time_resolution=9, channels=8, multires=(1, 2), width=12)
+    hexplane = planes((5, 6, 7), 9, 8, (1, 2))
     cfg = replace(cfg, deformation=replace(cfg.deformation, hexplane=hexplane))
     points = np.random.default_rng(0).uniform(-10, 10, (40, 3)).astype(np.float32) + np.float32([0, 0, 60])
     gaussians = create_gaussians(points, np.full((40, 3), 0.5, np.float32), np.zeros(40, np.float32), cfg)

@@ -1,19 +1,22 @@
 """Configs: the paper's numbers, strict JSON, presets, command-line agreement."""
 
 import dataclasses
+import functools
 import json
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from endoprior.cli.arguments import parse
 from endoprior.cli.train import HELP, Train
-from endoprior.core import config_io
+from endoprior.core import config_io, former_config
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config, DensityConfig
-from endoprior.core.config_deformation import BasisConfig, HexPlaneConfig
+from endoprior.core.config import Config
+from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.model.gaussians import motion_shape
+from endoprior.model.method import config_from
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.folder import reject_other_run
@@ -22,12 +25,15 @@ PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_tex
 PRESETS = ("default", "best", "paper", "released", "endogaussian")
 
 
-@pytest.mark.parametrize("field", sorted(PAPER_VALUES))
-def test_defaults_are_the_papers(field):
-    value = Config()
-    for name in field.split("."):
-        value = getattr(value, name)
-    assert value == PAPER_VALUES[field]
+@pytest.mark.parametrize("name", sorted(PAPER_VALUES))
+def test_preset_and_constants_are_the_papers(name):
+    """Names in capitals are constants of modules, the others fields."""
+    path, _, last = name.rpartition(".")
+    if last.isupper():
+        value = getattr(import_module(f"endoprior.{path}"), last)
+    else:
+        value = functools.reduce(getattr, name.split("."), preset("paper"))
+    assert value == PAPER_VALUES[name]
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -50,7 +56,6 @@ def test_missing_fields_keep_their_defaults():
         ({"seed": None}, "config.seed"),
         ({"temporal": {"gradient": "none"}}, "config.temporal.gradient"),
         ({"deformation": {"hexplane": {"multires": [1, "2"]}}}, "config.deformation.hexplane.multires[1]"),
-        ({"deformation": {"hexplane": {"resolution": [1, 2]}}}, "config.deformation.hexplane.resolution"),
         ({"init": {"budget": 0}}, "config.init"),
         ({"density": {"min_densify_weight": float("nan")}}, "config.density.min_densify_weight"),
         ({"density": {"min_densify_weight": 2}}, "config.density"),
@@ -68,26 +73,28 @@ def test_unknown_preset():
         preset("finest")
 
 
-def test_paper_preset_is_the_defaults():
-    assert preset("paper") == Config()
+def test_the_preset_default_is_that_of_the_class():
+    assert preset("default") == Config()
+
+
+def test_there_are_at_most_70_fields():
+    assert len(dict(leaves(to_dict(Config())))) <= 70
 
 
 def test_baseline_knows_no_prior():
     cfg = preset("endogaussian")
-    assert cfg.init.sampler == "pool" and cfg.temporal.weight == 0
-    assert cfg.density.min_densify_weight == 1 and not cfg.density.prior_prune
+    assert cfg.init.sampler == "pool" and cfg.temporal.weight == 0 and cfg.density.min_densify_weight == 1
 
 
 def test_only_tuples_lists_and_plain_values_are_configured():
     assert to_dict(HexPlaneConfig())["multires"] == [1, 2, 4, 8]
-    assert to_dict(DensityConfig())["prior_prune"] is True
+    assert to_dict(DeformationConfig())["deform_shape"] is True
 
 
 def test_basis_functions_follow_the_length_of_the_sequence():
     basis = BasisConfig(num_bases=0)
     assert [basis.fitted(n).num_bases for n in (5, 24, 48, 63, 156)] == [4, 13, 27, 35, 87]
     assert BasisConfig(num_bases=31).fitted(24).num_bases == 31
-    assert BasisConfig(num_bases=0, frames_per_basis=2.0).fitted(63).num_bases == 32
     fitted = preset("default").fitted(48)
     assert fitted.deformation.basis.num_bases == 27 and fitted.fitted(99) == fitted
     with pytest.raises(ValueError, match="num_bases: expected at least 2"):
@@ -137,8 +144,82 @@ def test_wrong_replacements_are_named(changes, says):
         preset("default").replace(changes)
 
 
-def test_fields_that_earlier_versions_wrote_are_ignored_and_named_once(capsys):
-    config_io.print_ignored.cache_clear()
+def leaves(values, prefix=""):
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+FORMER = json.loads((Path(__file__).parent / "former_configs.json").read_text())
+"""What the version before stored of each preset: 141 fields, as nested dicts, only where they differ from `paper`."""
+
+
+def former(name: str) -> dict:
+    """A stored config with all fields of the version before."""
+    merged = dict(leaves(FORMER["paper"])) | dict(leaves(FORMER[name]))
+    values: dict = {}
+    for field, value in merged.items():
+        *path, last = field.split(".")
+        functools.reduce(lambda group, part: group.setdefault(part, {}), path, values)[last] = value
+    return values
+
+
+@pytest.fixture
+def told(capsys):
+    """What was said about a stored config, each line once."""
+    former_config.print_once.cache_clear()
+    return lambda: capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(FORMER))
+def test_what_the_version_before_stored_is_the_preset_of_today(name, told):
+    stored = former(name)
+    assert len(dict(leaves(stored))) == 141
+    assert config_from(stored) == config_from(stored) == preset(name)
+    assert told() == (
+        "endoprior: stored config: 79 of its fields are constants of this version, with the same values\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"density.split_shrink": 2.0}, "density.split_shrink is 1.6 here and 2.0 there"),
+        ({"optim.means_lr": 1e-2}, "optim.means_lr_final is 0.0001 here and 5e-05 there"),
+        ({"temporal.pair_weights": False}, None),
+        ({"temporal.distance_weight": 0.0}, None),
+        ({"temporal.refill": True}, "temporal.refill is False here and True there"),
+        ({"deformation.deform_quats": False}, "deformation.deform_quats is True here and False there"),
+        ({"deformation.hexplane.width": 64}, None),  # which this preset does not have
+        ({"windows.shortest": 30}, "windows.shortest is 40 here and 30 there"),
+        ({"windows.enabled": False}, None),
+    ],
+)
+def test_a_stored_number_that_is_another_one_now_is_said(changes, says, told):
+    stored = former("default")
+    for name, value in changes.items():
+        *path, last = name.split(".")
+        functools.reduce(dict.__getitem__, path, stored)[last] = value
+    config_from(stored)
+    line = told()
+    assert line.count("\n") == 1
+    assert f"{says}: a run with it does not resume bit-identically\n" in line if says else "with the same" in line
+
+
+@pytest.mark.parametrize("name", ["relative_width", "frames_per_basis"])
+def test_a_scene_that_could_not_be_rendered_as_it_was_is_rejected(name, told):
+    stored = former("default")
+    stored["deformation"]["basis"][name] = 2.0
+    if name == "relative_width":
+        with pytest.raises(InputError, match=r"relative_width: expected 1\.5, got 2\.0\. Fix: Render this scene with"):
+            config_from(stored)
+    else:
+        config_from(stored)
+
+
+def test_what_nothing_is_left_of_is_ignored_and_named_once(told):
     now = Config(seed=3)
     stored = to_dict(now)
     stored["poses"], stored["loss"]["fit_relative_depth"] = {"refine": "always"}, True
@@ -146,17 +227,17 @@ def test_fields_that_earlier_versions_wrote_are_ignored_and_named_once(capsys):
     about = {"config": stored, "width": 9, "height": 9, "frames_per_second": 25.0}
     assert from_dict(SceneFacts, about, "about").config == now
     reject_other_run(Path("f"), stored, "data", now, "data", Path())
-    told = "endoprior: stored config: ignored poses, loss.fit_relative_depth, which this version does not have\n"
-    assert capsys.readouterr().err == told
+    line = "endoprior: stored config: ignored poses, loss.fit_relative_depth, which this version does not have\n"
+    assert told() == line
 
 
-@pytest.mark.parametrize("name", ["poses.refine", "loss.fit_relative_depth"])
+@pytest.mark.parametrize("name", ["poses.refine", "loss.fit_relative_depth", "density.split_shrink"])
 def test_a_former_field_cannot_be_set(name):
     with pytest.raises(InputError, match=f"got {name}"):
         Config().replace({name: True})
 
 
-@pytest.mark.parametrize("stored", [{"pose": {}}, {"loss": {"fit_depth": True}}, {"FORMER_FIELDS": []}])
+@pytest.mark.parametrize("stored", [{"pose": {}}, {"loss": {"fit_depth": True}}, {"of_stored": []}])
 def test_other_unknown_fields_of_a_stored_config_are_errors(stored):
     with pytest.raises(InputError, match="no such field"):
         from_dict(Config, stored)

@@ -12,7 +12,7 @@ from sequence_edits import change_poses, describe, write
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.core.geometry import back_project, project
-from endoprior.data import Truth, clean_depth, load_sequence
+from endoprior.data import Truth, clean_depth, load_sequence, pixels
 
 
 def rotation_about(axis: int, degrees: float) -> np.ndarray:
@@ -192,10 +192,11 @@ def test_numbers_in_names_sort_as_numbers(tiny_sequence):
 # --- depth cleaning
 
 
-def test_depth_is_clipped_to_percentiles_of_its_valid_values():
+def test_depth_is_clipped_to_percentiles_of_its_valid_values(monkeypatch):
+    monkeypatch.setattr(pixels, "CLIP_PERCENTILES", (3, 98))
     raw = np.zeros((10, 101), np.float32)
     raw[0] = np.arange(101) + 1.0  # percentile p is p + 1
-    depth, valid = clean_depth(raw, DataConfig(depth_clip_low_percentile=3, depth_clip_high_percentile=98))
+    depth, valid = clean_depth(raw)
     np.testing.assert_array_equal(depth[0], np.clip(raw[0], 4, 99))
     assert valid[0].all() and not valid[1:].any() and not depth[1:].any()
 

@@ -153,7 +153,7 @@ def test_density_control_only_splits_and_prunes():
 
 
 def test_the_loss_by_hand(tiny_sequence):
-    frames = TrainingFrames(load_sequence(tiny_sequence), preset("deform3dgs").prior)
+    frames = TrainingFrames(load_sequence(tiny_sequence))
     frame = frames.frame(0)
     height, width = frame.tissue_mask.shape
     out = RenderOutput(

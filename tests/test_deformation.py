@@ -9,20 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hexplane_grids import planes
 from reference import basis as reference_basis
 from reference.hexplane import displacement
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from endoprior.core.checks import InputError
-from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
+from endoprior.core.config_deformation import BasisConfig, DeformationConfig
+from endoprior.model import motion as motion_module
 from endoprior.model.gaussians import motion_layout, motion_shape
 from endoprior.model.hexplane_field import HexPlaneField, OffsetHeads, box_of_points, head_shapes
 from endoprior.model.motion import Offsets, basis_offsets, basis_weights
 from endoprior.model.ops import NUMBA
 
-SMALL = DeformationConfig(hexplane=HexPlaneConfig((6, 5, 4), 8, 12, (1, 2)))
-BASIS = DeformationConfig(kind="basis", basis=BasisConfig(num_bases=9, relative_width=0.7))
+SMALL = DeformationConfig(kind="hexplane", hexplane=planes((6, 5, 4), 8, 12, (1, 2)), max_scale_change=0.0)
+BASIS = DeformationConfig(basis=BasisConfig(num_bases=9), max_scale_change=0.0)
 
 
 def points(num: int = 60, seed: int = 0) -> Tensor:
@@ -113,7 +115,8 @@ def test_plane_gradients_reach_the_buffer_through_the_field() -> None:
     model = field()
     model.offsets(points(), 0.3, NUMBA).means.square().sum().backward()
     assert model.grid.grads.abs().sum() > 0
-    fixed = field(replace(SMALL, hexplane=replace(SMALL.hexplane, learn_box=False)))
+    fixed = field()
+    fixed.box.requires_grad_(False)
     fixed.offsets(points(), 0.3, NUMBA).means.square().sum().backward()
     assert fixed.box.grad is None and fixed.grid.grads.abs().sum() > 0
     assert model.box.grad.abs().sum() > 0
@@ -123,7 +126,7 @@ def test_plane_gradients_reach_the_buffer_through_the_field() -> None:
     ("cfg", "fields"),
     [
         (SMALL, {"means": (7, 3), "quats": (7, 4), "log_scales": (7, 3)}),
-        (replace(SMALL, deform_scales=False, deform_quats=False), {"means": (7, 3)}),
+        (replace(SMALL, deform_shape=False), {"means": (7, 3)}),
         (
             replace(SMALL, deform_opacity=True),
             {"means": (7, 3), "quats": (7, 4), "log_scales": (7, 3), "opacity_logits": (7,)},
@@ -153,8 +156,8 @@ def test_offsets_of_no_gaussians_and_of_a_subset() -> None:
 def test_heads_start_as_stated() -> None:
     width, features = 32, 256
     shapes = head_shapes(features, width, {"means": 3, "quats": 4})
-    default = OffsetHeads(shapes, "default", torch.Generator().manual_seed(1))
-    zero = OffsetHeads(shapes, "zero", torch.Generator().manual_seed(1))
+    default = OffsetHeads(shapes, torch.Generator().manual_seed(1))
+    zero = OffsetHeads(shapes, torch.Generator().manual_seed(1), zero_biases=True)
     for name, value in default.parameters.items():
         fan_in = features if name.startswith("trunk") else width
         if name.endswith("weight"):
@@ -163,7 +166,7 @@ def test_heads_start_as_stated() -> None:
         else:
             assert 0 < value.abs().max() <= 1 / math.sqrt(fan_in)
             assert not zero.parameters[name].any()
-    again = OffsetHeads(shapes, "default", torch.Generator().manual_seed(1))
+    again = OffsetHeads(shapes, torch.Generator().manual_seed(1))
     assert all(torch.equal(a, b) for a, b in zip(default.parameters.values(), again.parameters.values(), strict=True))
 
 
@@ -215,10 +218,9 @@ def test_motion_layout_follows_the_configuration() -> None:
         "log_scales": slice(7, 10),
         "sh_dc": slice(10, 13),
     }
-    rigid = replace(BASIS, deform_scales=False, deform_quats=False, deform_opacity=True)
+    rigid = replace(BASIS, deform_shape=False, deform_opacity=True)
     assert motion_layout(rigid) == {"means": slice(0, 3), "opacity_logits": slice(3, 4), "sh_dc": slice(4, 7)}
-    plain = replace(rigid, deform_opacity=False, basis=replace(BASIS.basis, deform_color=False))
-    assert motion_shape(plain) == (9, 3)
+    assert motion_shape(replace(rigid, deform_opacity=False)) == (9, 6)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999, 1.0])
@@ -234,8 +236,9 @@ def test_basis_by_its_definition(time: float) -> None:
     torch.testing.assert_close(torch.cat(parts, -1), total, rtol=1e-5, atol=1e-6)  # nine float32 terms
 
 
-def test_a_basis_function_ends_at_three_standard_deviations_without_a_jump() -> None:
-    cfg = BasisConfig(num_bases=101, relative_width=1.01)  # sigma = 0.01 = distance of the centers
+def test_a_basis_function_ends_at_three_standard_deviations_without_a_jump(monkeypatch) -> None:
+    monkeypatch.setattr(motion_module, "RELATIVE_WIDTH", 1.01)
+    cfg = BasisConfig(num_bases=101)  # sigma = 0.01 = distance of the centers
     assert np.flatnonzero(basis_weights(0.5 + 1e-9, cfg)).tolist() == list(range(48, 54))
     assert basis_weights(0.5, cfg)[50] == 1
     assert basis_weights(0.505, cfg)[47] == 0

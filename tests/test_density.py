@@ -8,15 +8,16 @@ import pytest
 import torch
 
 from endoprior.compute.morton import morton_order
-from endoprior.core.config import Config, DensityConfig
+from endoprior.core.config import ReleasedMethod
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan, apply_plan, split_children
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer, rate_of
 
-CFG = DensityConfig()
+CFG = preset("paper").density
 
 
 def output(means2d, radii=None):
@@ -39,7 +40,9 @@ def stats_of(num, *, gradient=0.0, score=None, num_valid=0, opacity=0.5):
 
 def gaussians(num, cfg=None, seed=0):
     rng = np.random.default_rng(seed)
-    return create_gaussians(rng.normal(size=(num, 3)), rng.random((num, 3)), rng.normal(size=num), cfg or Config())
+    return create_gaussians(
+        rng.normal(size=(num, 3)), rng.random((num, 3)), rng.normal(size=num), cfg or preset("paper")
+    )
 
 
 @pytest.mark.parametrize("c", [0.0, 0.3, 1.0])
@@ -158,27 +161,27 @@ def test_prior_prune_needs_all_three(num_valid, score, opacity, gone):
     stats = stats_of(1, score=score, num_valid=num_valid, opacity=opacity)
     planned = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, CFG)
     assert planned.remove.item() is gone
-    off = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, replace(CFG, prior_prune=False))
+    off = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, replace(CFG, min_densify_weight=1.0))
     assert not off.remove.item()
 
 
 def test_faint_and_huge_gaussians_go():
-    cfg = replace(CFG, prune_max_scale_mm=40.0)
+    released = ReleasedMethod(prune_max_scale_mm=40.0)
     scales = torch.tensor([[1.0] * 3, [41.0] * 3, [1.0] * 3])
-    planned = density.plan(stats_of(3), scales, torch.tensor([0.004, 0.5, 0.5]), 0.0, cfg)
+    planned = density.plan(stats_of(3), scales, torch.tensor([0.004, 0.5, 0.5]), 0.0, CFG, released)
     assert planned.remove.tolist() == [True, True, False]
 
 
 def test_a_huge_gaussian_whose_children_fit_is_split():
-    cfg = replace(CFG, prune_max_scale_mm=40.0)
+    released = ReleasedMethod(prune_max_scale_mm=40.0)
     stats = stats_of(2, gradient=1.0, score=1.0, num_valid=1)
-    planned = density.plan(stats, torch.tensor([[50.0] * 3, [70.0] * 3]), torch.full((2,), 0.5), 0.0, cfg)
+    planned = density.plan(stats, torch.tensor([[50.0] * 3, [70.0] * 3]), torch.full((2,), 0.5), 0.0, CFG, released)
     assert planned.split.tolist() == [True, False] and planned.remove.tolist() == [False, True]
 
 
-def test_growth_stops_at_the_guard():
-    cfg = replace(CFG, max_gaussians=3)
-    planned = density.plan(stats_of(3, gradient=1.0), torch.ones(3, 3), torch.full((3,), 0.5), 0.0, cfg)
+def test_growth_stops_at_the_guard(monkeypatch):
+    monkeypatch.setattr(density, "MAX_GAUSSIANS", 3)
+    planned = density.plan(stats_of(3, gradient=1.0), torch.ones(3, 3), torch.full((3,), 0.5), 0.0, CFG)
     assert not planned.split.any()
 
 
@@ -191,7 +194,7 @@ def test_events_of_the_published_schedule():
 
 @pytest.mark.parametrize("kind", ["hexplane", "basis"])
 def test_every_row_stays_together_through_a_plan(kind):
-    cfg = Config()
+    cfg = preset("paper", **{"deformation.basis.num_bases": 31})
     cfg = replace(cfg, deformation=replace(cfg.deformation, kind=kind))
     model = gaussians(6, cfg)
     optimizer = Optimizer(model, None, cfg, partial(rate_of, cfg=cfg, spatial_scale=10.0), NUMBA)
@@ -236,6 +239,5 @@ def test_children_of_a_split_come_from_the_parent_and_are_smaller():
 
 
 def test_extent_of_a_still_camera_is_zero():
-    centers, points = torch.zeros(5, 3), torch.tensor([[0.0, 0, 0], [2.0, 0, 0]])
-    assert density.scene_extent(centers, points, CFG) == 0
-    assert density.scene_extent(centers, points, replace(CFG, extent_mode="scene")) == pytest.approx(1.1)
+    assert density.scene_extent(torch.zeros(5, 3)) == 0
+    assert density.scene_extent(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]])) == pytest.approx(1.1)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hexplane_grids import planes
 from method_runs import trained_and_resumed
 from scipy.spatial.transform import Rotation
 
@@ -12,7 +13,6 @@ from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.types import RenderOutput, Splats
 from endoprior.data import load_sequence
 from endoprior.model.gaussians import SH_C0, create_gaussians
-from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
@@ -20,7 +20,7 @@ from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
-from endoprior_baselines.endo4dgs import METHOD
+from endoprior_baselines.endo4dgs import METHOD, SmallField
 from endoprior_baselines.endo4dgs_terms import (
     confident_error,
     gradient_correlation,
@@ -31,13 +31,13 @@ from endoprior_baselines.endo4dgs_terms import (
 )
 
 CFG = preset("endo4dgs")
-SMALL = HexPlaneConfig(resolution=(6, 5, 4), time_resolution=7, channels=3, multires=(1, 2), width=8, learn_box=False)
+SMALL = planes((6, 5, 4), 7, 3, (1, 2))
 
 
 def test_the_field_has_the_published_shapes():
-    shapes = HexPlaneField.state_shapes(CFG.deformation)
+    shapes = SmallField.state_shapes(CFG.deformation)
     assert shapes["hexplane.0.xy"] == (64, 64, 32) and shapes["hexplane.1.zt"] == (75, 128, 32)
-    assert "hexplane.2.xy" not in shapes and "box" not in HexPlaneField.parameter_shapes(CFG.deformation)
+    assert "hexplane.2.xy" not in shapes and "box" not in SmallField.parameter_shapes(CFG.deformation)
     weights = [shape for name, shape in shapes.items() if name.endswith("weight")]
     assert weights == [(64, 64), (64, 64), (3, 64), (64, 64), (4, 64), (64, 64), (3, 64)]
     gaussians = create_gaussians(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), CFG)
@@ -121,7 +121,7 @@ def test_confident_error_by_hand():
 
 
 def test_the_loss_by_hand(tiny_sequence):
-    frame = TrainingFrames(load_sequence(tiny_sequence), CFG.prior).frame(0)
+    frame = TrainingFrames(load_sequence(tiny_sequence)).frame(0)
     ones = torch.ones_like(frame.depth)
     out = RenderOutput(frame.rgb + 0.1, ones, 2 * frame.depth, torch.zeros(1, 2), torch.zeros(1))
     gray = create_gaussians(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), CFG).splats(None, 0)
@@ -134,7 +134,7 @@ def test_the_loss_by_hand(tiny_sequence):
 
 
 def test_a_frame_without_tissue_has_finite_terms_and_gradients(tiny_sequence):
-    frame = TrainingFrames(load_sequence(tiny_sequence), CFG.prior).frame(0)
+    frame = TrainingFrames(load_sequence(tiny_sequence)).frame(0)
     none = torch.zeros_like(frame.tissue_mask)
     frame = replace(frame, tissue_mask=none, measured=none, num_measured=0)
     color, depth = frame.rgb.requires_grad_(), frame.depth.requires_grad_()
@@ -180,7 +180,7 @@ def test_it_trains_resumes_with_equal_bits_and_comes_back(tiny_sequence, tmp_pat
     cfg = replace(
         cfg,
         schedule=replace(cfg.schedule, coarse_iterations=4, sh_every=3),
-        deformation=replace(cfg.deformation, hexplane=SMALL),
+        deformation=replace(cfg.deformation, hexplane=HexPlaneConfig(7, 3, (1,))),
     )
     sequence, seen = load_sequence(tiny_sequence), []
     train(sequence, cfg, on_step=lambda report, _: seen.append(set(report.losses)))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hexplane_grids import planes
 from method_runs import trained_and_resumed
 
 from endoprior.core.config_deformation import HexPlaneConfig
@@ -26,7 +27,7 @@ from endoprior_baselines.endogs_field import JointField
 from endoprior_baselines.plane_terms import PlaneWeights, plane_term
 
 CFG = preset("endogs")
-SMALL = HexPlaneConfig(resolution=(6, 5, 4), time_resolution=7, channels=3, multires=(1, 2), width=8)
+SMALL = planes((6, 5, 4), 7, 3, (1, 2))
 
 
 def tiny():
@@ -34,7 +35,7 @@ def tiny():
     changes = {"density.start_iteration": 2, "density.every": 3, "density.grow_threshold": 1e-6}
     cfg = preset("endogs", iterations=7, gaussians=200, **changes)
     schedule = replace(cfg.schedule, coarse_iterations=4, sh_every=3)
-    return replace(cfg, schedule=schedule, deformation=replace(cfg.deformation, hexplane=SMALL))
+    return replace(cfg, schedule=schedule, deformation=replace(cfg.deformation, hexplane=HexPlaneConfig(7, 3, (1,))))
 
 
 # The field.
@@ -111,7 +112,7 @@ def test_plane_terms_are_their_formula_and_its_gradient():
 
 
 def test_the_loss_by_hand(tiny_sequence):
-    frames = TrainingFrames(load_sequence(tiny_sequence), CFG.prior)
+    frames = TrainingFrames(load_sequence(tiny_sequence))
     hidden = sum((~frames.frame(i).tissue_mask).double() for i in range(len(frames)))
     weight = METHOD.context(frames, CFG)
     torch.testing.assert_close(weight.double(), 1 + 30 * hidden / hidden.square().sum().sqrt())
@@ -128,7 +129,7 @@ def test_the_loss_by_hand(tiny_sequence):
 
 
 def test_at_half_resolution_a_pixel_has_the_mean_weight_of_its_block(tiny_sequence):
-    frames = TrainingFrames(load_sequence(tiny_sequence), CFG.prior)
+    frames = TrainingFrames(load_sequence(tiny_sequence))
     weight, frame = METHOD.context(frames, CFG), frames.frame(0, half=True)
     out = RenderOutput(frame.rgb + 0.1, torch.ones(20, 24), frame.depth, torch.zeros(1, 2), torch.zeros(1))
     drawn = Drawn(Stage.FINE, 1, 0, frame, None, random_field(), None, None, out, None, weight)
@@ -137,20 +138,21 @@ def test_at_half_resolution_a_pixel_has_the_mean_weight_of_its_block(tiny_sequen
     assert float(terms["color"]) == pytest.approx(0.1 * float((blocks * frame.tissue_mask).mean()), rel=1e-4)
 
 
-def random_field(**planes) -> JointField:
+def random_field() -> JointField:
     """A small one around random points."""
-    cfg = replace(CFG, deformation=replace(CFG.deformation, hexplane=replace(SMALL, **planes)))
+    cfg = replace(CFG, deformation=replace(CFG.deformation, hexplane=SMALL))
     return METHOD.motion(cfg).field(torch.rand(20, 3, generator=torch.Generator().manual_seed(0)), cfg)
 
 
 def test_planes_are_regularized_whether_or_not_the_box_is_learned(tiny_sequence):
-    frame = TrainingFrames(load_sequence(tiny_sequence), CFG.prior).frame(0)
+    frame = TrainingFrames(load_sequence(tiny_sequence)).frame(0)
     out = RenderOutput(frame.rgb, torch.ones(40, 48), frame.depth, torch.zeros(1, 2), torch.zeros(1))
-    for learn_box in (True, False):
-        field = random_field(learn_box=learn_box)
+    for learns_box in (True, False):
+        field = random_field()
+        field.box.requires_grad_(learns_box)
         drawn = Drawn(Stage.FINE, 1, 0, frame, None, field, None, None, out, None, torch.ones(40, 48))
         METHOD.terms(drawn, CFG, NUMBA)["planes"].backward()
-        assert field.grid.grads.any(), learn_box
+        assert field.grid.grads.any(), learns_box
 
 
 def test_depth_is_compared_without_its_scale():

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from export_scenes import moving_scene, plane_camera
+from hexplane_grids import planes
 
-from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.export.axes import ROTATIONS
 from endoprior.export.formats import FORMATS
 from endoprior.model.gaussians import create_gaussians
@@ -42,13 +42,11 @@ def check(scene: Scene, found: tuple, time: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"deform_opacity": True}, {"deform_quats": False}, {"deform_scales": False, "deform_quats": False}]
+    "changes", [{}, {"deform_opacity": True}, {"deform_shape": False}, {"deform_shape": False, "deform_opacity": True}]
 )
-@pytest.mark.parametrize("color", [True, False])
-def test_reader_evaluates_the_basis(reader, tmp_path, changes, color):
+def test_reader_evaluates_the_basis(reader, tmp_path, changes):
     cfg = preset("default").fitted(20)
-    basis = replace(cfg.deformation.basis, deform_color=color)
-    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=basis, **changes))
+    cfg = replace(cfg, deformation=replace(cfg.deformation, **changes))
     cfg = replace(cfg, schedule=replace(cfg.schedule, sh_degree=1))
     scene = replace(random_scene(cfg), field=None)
     scene.save(tmp_path / "scene.safetensors")
@@ -58,12 +56,9 @@ def test_reader_evaluates_the_basis(reader, tmp_path, changes, color):
     assert not np.allclose(reader.at(arrays, about, 0.1)[0], reader.at(arrays, about, 0.6)[0], atol=1e-2)
 
 
-@pytest.mark.parametrize("time_map", ["raw", "full"])
-def test_reader_evaluates_the_hexplane(reader, tmp_path, time_map):
+def test_reader_evaluates_the_hexplane(reader, tmp_path):
     cfg = preset("paper").fitted(20)
-    hexplane = HexPlaneConfig(
-        resolution=(5, 6, 7), time_resolution=9, channels=8, multires=(1, 2), width=12, time_map=time_map
-    )
+    hexplane = planes((5, 6, 7), 9, 8, (1, 2))
     cfg = replace(cfg, deformation=replace(cfg.deformation, hexplane=hexplane, deform_opacity=True))
     scene = random_scene(cfg)
     means = scene.gaussians["means"].detach()

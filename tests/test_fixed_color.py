@@ -96,16 +96,6 @@ def test_color_that_changes_does_not_move_the_grid():
     assert np.array_equal(painted(scene, MIDDLE), painted(scene, 0))
 
 
-def test_a_scene_without_color_over_time_is_painted_too():
-    scene = wall(shift_mm=2)
-    basis = replace(scene.config.deformation.basis, deform_color=False)
-    layout = motion_layout(scene.config.deformation)
-    config = replace(scene.config, deformation=replace(scene.config.deformation, basis=basis))
-    motion = torch.cat([scene.gaussians["motion"][..., part] for name, part in layout.items() if name != "sh_dc"], -1)
-    plain = replace(scene, config=config, gaussians=Gaussians(scene.gaussians.tensors | {"motion": motion}))
-    assert np.allclose(painted(plain, MIDDLE), painted(scene, MIDDLE), atol=1e-5)
-
-
 def test_what_the_first_frame_hides_is_not_painted():
     # A strip in front of the wall moves away in the middle frame.
     scene = wall()
@@ -140,7 +130,6 @@ def test_without_color_over_time_or_without_change_there_is_no_share():
     with pytest.raises(ScoreUnavailable, match="nothing changes"):
         color_share(wall())
     scene = wall()
-    basis = replace(scene.config.deformation.basis, deform_color=False)
-    config = replace(scene.config, deformation=replace(scene.config.deformation, basis=basis))
+    config = scene.config.replace({"deformation.kind": "hexplane", "init.motion": "rest"})
     with pytest.raises(ScoreUnavailable, match="do not change with time"):
         color_share(replace(scene, config=config))

@@ -1,10 +1,12 @@
 """How many Gaussians came and went: counts of a plan, lines of the log, and rules that never fired."""
 
 import json
+from dataclasses import replace
 
 import torch
 
-from endoprior.core.config import DensityConfig
+from endoprior.core.config import ReleasedMethod
+from endoprior.model.presets import preset
 from endoprior.runs.log import growth_of
 from endoprior.training.density import DensityStats, plan
 from endoprior_studies.matrix import Matrix
@@ -25,8 +27,10 @@ def test_a_plan_counts_what_each_rule_takes():
     stats.opacity_sum += 30 * 0.006
     stats.score_sum[:] = 30 * torch.tensor([1.0, 1, 0, 1, 1])  # the third one is distrusted
     opacities = torch.tensor([0.5, 0.001, 0.5, 0.5, 0.5])  # the second one is faint
-    cfg = DensityConfig(prune_max_scale_mm=40.0)
-    found = plan(stats, torch.tensor([[1.0] * 3, [1.0] * 3, [1.0] * 3, [50.0] * 3, [50.0] * 3]), opacities, 1e3, cfg)
+    cfg, released = preset("paper").density, ReleasedMethod(prune_max_scale_mm=40.0)
+    found = plan(
+        stats, torch.tensor([[1.0] * 3, [1.0] * 3, [1.0] * 3, [50.0] * 3, [50.0] * 3]), opacities, 1e3, cfg, released
+    )
     assert found.counts() == {
         "cloned": 1,
         "split": 1,  # the last one is huge, its children are not
@@ -34,9 +38,8 @@ def test_a_plan_counts_what_each_rule_takes():
         "removed_size": 1,
         "removed_prior": 1,
     }
-    assert (
-        "removed_prior" not in plan(stats, torch.ones(5, 3), opacities, 1e3, DensityConfig(prior_prune=False)).counts()
-    )
+    plain = replace(cfg, min_densify_weight=1.0)
+    assert "removed_prior" not in plan(stats, torch.ones(5, 3), opacities, 1e3, plain).counts()
 
 
 def test_growth_is_that_of_all_windows_by_the_log(tmp_path):

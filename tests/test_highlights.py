@@ -100,8 +100,7 @@ def test_what_no_frame_shows_is_left_alone():
 
 def test_colors_that_never_change_have_no_highlights_to_find():
     lit = wall(moving)
-    basis = replace(lit.config.deformation.basis, deform_color=False)
-    cfg = replace(lit.config, deformation=replace(lit.config.deformation, basis=basis))
+    cfg = lit.config.replace({"deformation.kind": "hexplane", "init.motion": "rest"})
     with pytest.raises(InputError, match="expected a scene whose colors change with time"):
         without_highlights(replace(lit, config=cfg), lambda window: [])
 

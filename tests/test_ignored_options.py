@@ -47,12 +47,12 @@ def test_what_a_method_ignores_is_an_error_before_anything_is_computed(tiny_sequ
 def test_a_radiance_field_has_one_window(make_tiny_sequence, name):
     folder = make_tiny_sequence(num_frames=12, width=10, height=8)
     for longest in (12, 6):
-        windows = WindowConfig(enabled=True, shortest=4, longest=longest, overlap=2)
+        windows = WindowConfig(longest=longest)
         cfg = replace(preset(name, iterations=1), windows=windows)
         if longest == 12:
             start(folder, cfg)
         else:
-            with pytest.raises(InputError, match=rf"windows\.enabled: expected False with method {name}.*no-enabled"):
+            with pytest.raises(InputError, match=rf"windows\.longest: expected 0 with method {name}.*longest 0"):
                 start(folder, cfg)
 
 

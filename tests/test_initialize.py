@@ -12,10 +12,11 @@ import pytest
 from scipy.stats import chisquare
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig, SpecularConfig
+from endoprior.core.config import InitConfig, ReleasedMethod
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
+from endoprior.initialization import sampling
 from endoprior.initialization.sampling import (
     PointCloud,
     eroded_mask,
@@ -119,7 +120,7 @@ def test_distribution_matches_loop(rho, mask):
 
 @pytest.mark.parametrize("eta", [0.0, 0.45, 1.0])
 def test_distribution_sums_to_one_inside_the_eroded_mask(rho, mask, eta):
-    probability = sampling_distribution(rho, mask, InitConfig(uniform_fraction=eta))
+    probability = sampling_distribution(rho, mask, eta)
     assert probability.dtype == np.float64
     assert probability.sum() == pytest.approx(1, abs=1e-12)  # float64, 800 terms
     assert not probability[~eroded_mask(mask, 9)].any() and probability.min() >= 0
@@ -127,7 +128,7 @@ def test_distribution_sums_to_one_inside_the_eroded_mask(rho, mask, eta):
 
 @pytest.mark.parametrize("eta", [0.0, 0.45])
 def test_no_texture_gives_uniform_sampling(mask, eta):
-    probability = sampling_distribution(np.zeros((HEIGHT, WIDTH)), mask, InitConfig(uniform_fraction=eta))
+    probability = sampling_distribution(np.zeros((HEIGHT, WIDTH)), mask, eta)
     inside = probability[eroded_mask(mask, 9)]
     np.testing.assert_allclose(inside, 1 / len(inside), rtol=1e-12)
 
@@ -148,8 +149,9 @@ def test_invalid_prior_is_named(rho, mask):
 # --- drawing
 
 
-def test_single_samples_follow_the_distribution(rho, mask):
-    probability = sampling_distribution(rho[:12, :16], mask[:12, :16], InitConfig(erosion_px=5))
+def test_single_samples_follow_the_distribution(rho, mask, monkeypatch):
+    monkeypatch.setattr(sampling, "EROSION_PX", 5)
+    probability = sampling_distribution(rho[:12, :16], mask[:12, :16])
     rng = np.random.default_rng(7)
     draws = 50_000
     drawn = np.bincount(
@@ -161,9 +163,10 @@ def test_single_samples_follow_the_distribution(rho, mask):
     assert chisquare(drawn[possible], draws * probability[possible]).pvalue > 1e-4
 
 
-def test_a_million_samples_without_replacement_follow_the_distribution(rho, mask):
+def test_a_million_samples_without_replacement_follow_the_distribution(rho, mask, monkeypatch):
     # Tiled 1,250 times, each pixel is so rare that drawing 2 % of the field leaves the odds as they were.
-    probability = sampling_distribution(rho[:12, :16], mask[:12, :16], InitConfig(erosion_px=5))
+    monkeypatch.setattr(sampling, "EROSION_PX", 5)
+    probability = sampling_distribution(rho[:12, :16], mask[:12, :16])
     tiles = 1250
     field = np.tile(probability.reshape(1, -1), (tiles, 1))
     rng = np.random.default_rng(8)
@@ -210,9 +213,10 @@ def test_published_shares():
 
 
 @pytest.mark.parametrize("sampler", ["prior", "uniform", "pool"])
-def test_points_project_onto_centers_of_measured_tissue(mask, sampler):
+def test_points_project_onto_centers_of_measured_tissue(mask, sampler, monkeypatch):
+    monkeypatch.setattr(sampling, "POOL_FRACTION", 0.3)
     frame = make_frame(mask)
-    cloud = initial_points([frame], InitConfig(sampler=sampler, budget=150, pool_fraction=0.3))
+    cloud = initial_points([frame], InitConfig(sampler=sampler, budget=150))
     assert len(cloud) == 150 and cloud.points.dtype == cloud.colors.dtype == np.float32
     pixels = pixels_of(cloud, frame.camera)
     corner = pixels - 0.5
@@ -234,7 +238,10 @@ def test_points_project_onto_centers_of_measured_tissue(mask, sampler):
 
 def test_legacy_offset_is_half_a_pixel_up_left(mask):
     frame = make_frame(mask)
-    exact, legacy = (initial_points([frame], InitConfig(budget=80, pixel_offset=o)) for o in ("exact", "legacy"))
+    exact, legacy = (
+        initial_points([frame], InitConfig(budget=80), ReleasedMethod(half_pixel_shift=shifted))
+        for shifted in (False, True)
+    )
     shift = pixels_of(legacy, frame.camera) - pixels_of(exact, frame.camera)
     np.testing.assert_allclose(shift, -0.5, atol=2e-5)  # float32 points, as above
 
@@ -242,9 +249,8 @@ def test_legacy_offset_is_half_a_pixel_up_left(mask):
 @pytest.mark.parametrize(("name", "offset"), [("default", 0.5), ("paper", 0.5), ("released", 0), ("endogaussian", 0)])
 def test_pixels_that_presets_back_project(mask, name, offset):
     """The programs of EndoGaussian and EndoPrior-GS take integer pixels; the equations say nothing."""
-    cfg = replace(preset(name).init, budget=80, cleanup=False)
-    frame = make_frame(mask)
-    pixels = pixels_of(initial_points([frame], cfg), frame.camera)
+    cfg, frame = preset(name, **{"init.budget": 80, "released.cleanup": False}), make_frame(mask)
+    pixels = pixels_of(initial_points([frame], cfg.init, cfg.released), frame.camera)
     np.testing.assert_allclose(pixels - np.floor(pixels + 1e-3), offset, atol=2e-5)  # float32 points, as above
 
 
@@ -264,17 +270,19 @@ def test_every_frame_contributes_its_share(mask):
     assert [sum(tuple(c) in known for c in cloud.colors) for known in colors] == [34, 34, 33]
 
 
-def test_pool_keeps_a_share_of_each_frame(mask):
+def test_pool_keeps_a_share_of_each_frame(mask, monkeypatch):
+    monkeypatch.setattr(sampling, "POOL_FRACTION", 0.05)
     frames = [make_frame(mask, i) for i in range(4)]
-    cloud = initial_points(frames, InitConfig(budget=5000, sampler="pool", pool_fraction=0.05))
+    cloud = initial_points(frames, InitConfig(budget=5000, sampler="pool"))
     usable = int((mask & frames[0].depth_valid).sum())
     # 5,000 draws from 4 x 30 points miss none of them
     assert len(cloud) == 5000 and len(np.unique(cloud.points, axis=0)) == 4 * int(0.05 * usable)
 
 
-def test_pool_of_a_tiny_share_still_has_a_point_of_each_frame(mask):
+def test_pool_of_a_tiny_share_still_has_a_point_of_each_frame(mask, monkeypatch):
+    monkeypatch.setattr(sampling, "POOL_FRACTION", 0)
     frames = [make_frame(mask, i) for i in range(4)]
-    cloud = initial_points(frames, InitConfig(budget=200, sampler="pool", pool_fraction=0))
+    cloud = initial_points(frames, InitConfig(budget=200, sampler="pool"))
     assert len(np.unique(cloud.points, axis=0)) == 4
 
 
@@ -304,52 +312,28 @@ def test_nothing_to_sample_is_bad_input(mask, sampler, frames, caplog):
     assert "\n" not in str(caught.value) and caplog.text.count("\n") <= 1
 
 
-def test_released_options_change_the_weights(mask):
+def test_released_prior_raises_its_threshold_and_takes_the_eroded_mask(mask):
     frame = make_frame(mask)
     frame = replace(frame, rgb_u8=(frame.rgb_u8 // 2 + 120))  # bright: the 97th percentile exceeds 0.85
     eroded = eroded_mask(mask, 9)
-    base, prior = InitConfig(), PriorConfig()
-    bright = np.percentile(frame.rgb.max(-1)[eroded], 97)
+    bright = float(np.percentile(frame.rgb.max(-1)[eroded], 97))
     assert bright > 0.86
-    raised = PriorConfig(specular=SpecularConfig(value_threshold=float(bright)))
-    cases = [
-        (base, joint_texture_prior(frame.rgb, mask, prior)),
-        (replace(base, adaptive_specular=True), joint_texture_prior(frame.rgb, mask, raised)),
-        (replace(base, salience_on_eroded_mask=True), joint_texture_prior(frame.rgb, eroded, prior)),
-    ]
     results = []
-    for cfg, rho in cases:
-        want = np.where(frame.depth_valid, sampling_distribution(rho, mask, cfg), 0)
-        np.testing.assert_array_equal(pixel_probability(frame, cfg, prior), want)
-        results.append(want)
-    assert not np.allclose(results[0], results[1]) and not np.allclose(results[0], results[2])
-
-
-def test_border_of_the_initialization_is_a_setting_of_its_own(mask):
-    frame, released, results = make_frame(mask), preset("released"), []
-    for border in ("reflect", "zero"):
-        cfg = replace(InitConfig(), salience_border=border)
-        rho = joint_texture_prior(frame.rgb, mask, PriorConfig(salience=SalienceConfig(border=border)))
-        results.append(np.where(frame.depth_valid, sampling_distribution(rho, mask, cfg), 0))
-        np.testing.assert_array_equal(pixel_probability(frame, cfg, released.prior), results[-1])
+    for released, rho in (
+        (False, joint_texture_prior(frame.rgb, mask)),
+        (True, joint_texture_prior(frame.rgb, eroded, value_threshold=bright)),
+    ):
+        results.append(np.where(frame.depth_valid, sampling_distribution(rho, mask), 0))
+        np.testing.assert_array_equal(pixel_probability(frame, InitConfig(), released), results[-1])
     assert not np.allclose(*results)
-    assert (released.init.salience_border, released.prior.salience.border) == ("reflect", "zero")
 
 
 def test_adaptive_threshold_never_falls(mask):
     frame = make_frame(mask)
     dim = replace(frame, rgb_u8=frame.rgb_u8 // 4)
-    adaptive = InitConfig(adaptive_specular=True)
-    np.testing.assert_array_equal(
-        pixel_probability(dim, adaptive, PriorConfig()), pixel_probability(dim, InitConfig(), PriorConfig())
-    )
-
-
-def test_prior_config_reaches_the_sampler(mask):
-    frame = make_frame(mask)
-    other = PriorConfig(salience=SalienceConfig(percentile=50))
-    plain, changed = (pixel_probability(frame, InitConfig(), p) for p in (PriorConfig(), other))
-    assert not np.array_equal(plain, changed)
+    rho = joint_texture_prior(dim.rgb, eroded_mask(mask, 9))
+    want = np.where(frame.depth_valid, sampling_distribution(rho, mask), 0)
+    np.testing.assert_array_equal(pixel_probability(dim, InitConfig(), True), want)
 
 
 def test_texture_attracts_points():
@@ -362,11 +346,11 @@ def test_texture_attracts_points():
     assert left == pytest.approx(0.45 / 2, abs=0.1)  # only the even share; binomial, 100 draws: sd 0.04
 
 
-def test_clean_up_merges_and_removes(mask):
+def test_clean_up_merges_and_removes(mask, monkeypatch):
+    monkeypatch.setattr(sampling, "VOXEL_DIVISIONS", 20)
     frames = [make_frame(mask, i) for i in range(3)]
     plain = InitConfig(budget=600)
-    cfg = replace(plain, cleanup=True, voxel_divisions=20)
-    cloud = initial_points(frames, cfg)
+    cloud = initial_points(frames, plain, ReleasedMethod(cleanup=True))
     want = remove_outliers(merge_voxels(initial_points(frames, plain), 20), 20, 1.5)
     np.testing.assert_array_equal(cloud.points, want.points)
     assert 4 < len(cloud) < 600
@@ -395,7 +379,7 @@ def test_test_frames_are_never_read(tiny_sequence):
 
 def test_real_clip(real_clip):
     frames = load_sequence(real_clip).frames("train")[:6]
-    cloud = initial_points(frames, InitConfig(budget=2000, cleanup=True))
+    cloud = initial_points(frames, InitConfig(budget=2000), ReleasedMethod(cleanup=True))
     assert 1500 < len(cloud) < 2000
     spacing = np.exp(initial_log_scales(cloud.points))
     assert 0.2 < np.median(spacing) < 10  # mm, a field of about 130 x 110 mm

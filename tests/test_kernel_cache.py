@@ -56,7 +56,7 @@ def test_it_is_filled_once_for_what_needs_the_same_kernels(cold):
 def test_the_temporal_term_has_kernels_of_its_own(cold):
     asked, _ = cold
     paper = preset("paper")
-    either_end = replace(paper, temporal=replace(paper.temporal, valid_at_both=False))
+    either_end = replace(paper, temporal=replace(paper.temporal, gradient="current"))
     for number, cfg in enumerate((preset("endogaussian"), paper, either_end), 1):
         kernel_cache.fill(cfg)
         assert len(asked) == number

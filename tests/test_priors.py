@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 
 import numpy as np
 import pytest
 
-from endoprior.core.config import PriorConfig, SalienceConfig, SpecularConfig
-from endoprior.priors import edge_magnitude, joint_texture_prior, salience, specular_likelihood
+from endoprior.priors import edge_magnitude, joint_texture_prior, salience, specular, specular_likelihood
 from endoprior.priors.salience import EPSILON
 
 HEIGHT, WIDTH = 24, 30
@@ -33,7 +33,7 @@ def ones(height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
 # --- specular likelihood, Eq. (2)
 
 
-def specular_loop(rgb: np.ndarray, cfg: SpecularConfig) -> np.ndarray:
+def specular_loop(rgb: np.ndarray) -> np.ndarray:
     """Eq. (2) pixel by pixel in double precision."""
     out = np.zeros(rgb.shape[:2])
     for v in range(rgb.shape[0]):
@@ -41,17 +41,16 @@ def specular_loop(rgb: np.ndarray, cfg: SpecularConfig) -> np.ndarray:
             channels = [float(c) for c in rgb[v, u]]
             value = max(channels)
             saturation = (value - min(channels)) / (value + 1e-6)
-            bright = 1 / (1 + math.exp(-(value - cfg.value_threshold) / cfg.value_temperature))
-            pale = 1 / (1 + math.exp(-(cfg.saturation_threshold - saturation) / cfg.saturation_temperature))
-            over = sum(c > cfg.clip_threshold for c in channels)
+            bright = 1 / (1 + math.exp(-(value - 0.85) / 0.04))
+            pale = 1 / (1 + math.exp(-(0.35 - saturation) / 0.08))
+            over = sum(c > 0.92 for c in channels)
             out[v, u] = 1.0 if over >= 2 else max(bright * pale, 0.0)
     return out
 
 
 def test_specular_matches_loop(rgb):
-    cfg = SpecularConfig()
     # float32 against float64 with slopes up to 1/0.04: 25 * 6e-8 * a few operations
-    np.testing.assert_allclose(specular_likelihood(rgb, cfg), specular_loop(rgb, cfg), atol=1e-5)
+    np.testing.assert_allclose(specular_likelihood(rgb), specular_loop(rgb), atol=1e-5)
 
 
 def test_specular_at_both_thresholds_is_a_quarter():
@@ -70,10 +69,11 @@ def test_clip_needs_two_channels_strictly_above(pixel, clipped):
     assert (likelihood == 1) == clipped
 
 
-def test_specular_survives_extreme_temperatures():
-    cfg = SpecularConfig(value_temperature=1e-30, saturation_temperature=1e-30)
+def test_specular_survives_extreme_temperatures(monkeypatch):
+    for name in ("VALUE_TEMPERATURE", "SATURATION_TEMPERATURE"):
+        monkeypatch.setattr(specular, name, 1e-30)
     pixels = np.array([[[0, 0, 0], [0.9, 0.9, 0.9], [0.9, 0, 0]]], np.float32)
-    np.testing.assert_array_equal(specular_likelihood(pixels, cfg), [[0, 1, 0]])
+    np.testing.assert_array_equal(specular_likelihood(pixels), [[0, 1, 0]])
 
 
 # --- salience, Eqs. (3)-(5)
@@ -130,13 +130,14 @@ def test_constant_image_has_no_edge_unless_padded_with_zero():
 
 
 @pytest.mark.parametrize("percent", [0, 50, 99, 100])
-def test_salience_matches_loop(rgb, mask, percent):
+def test_salience_matches_loop(rgb, mask, percent, monkeypatch):
+    monkeypatch.setattr(sys.modules["endoprior.priors.salience"], "PERCENTILE", percent)
     gray = 0.299 * rgb[..., 0].astype(float) + 0.587 * rgb[..., 1] + 0.114 * rgb[..., 2]
     magnitude = sobel_loop(gray, "reflect")
     strong = percentile_loop([magnitude[v, u] for v, u in zip(*np.nonzero(mask), strict=True)], percent)
     want = np.minimum(magnitude / (strong + 1e-6), 1)
     # percent 0 divides by the weakest edge, about 0.05, which magnifies float32 rounding 20 times
-    np.testing.assert_allclose(salience(rgb, mask, SalienceConfig(percentile=percent)), want, atol=1e-4)
+    np.testing.assert_allclose(salience(rgb, mask), want, atol=1e-4)
 
 
 def test_percentile_uses_tissue_only(rgb, mask):
@@ -221,9 +222,8 @@ def test_invalid_values_are_named(rgb, mask, change, message):
 
 
 def test_zero_border_reaches_the_joint_prior(rgb):
-    cfg = PriorConfig(salience=SalienceConfig(border="zero"))
     flat = np.full_like(rgb, 0.4)
-    assert joint_texture_prior(flat, ones(), cfg)[0].min() > 0.9
+    assert joint_texture_prior(flat, ones(), border="zero")[0].min() > 0.9
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.core.config import Config, DensityConfig
+from endoprior.core.config import DensityConfig, ReleasedMethod
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.training import density
 from endoprior.training.density import DensityStats, apply_plan
 from endoprior.training.ops import NUMBA
@@ -36,52 +38,49 @@ def states(draw):
     stats = DensityStats(*(torch.tensor(np.asarray(v), dtype=torch.float32) for v in values))
     scales = torch.tensor(10.0 ** rng.uniform(-8, 8, (num, 1)) * rng.uniform(0.1, 1, (num, 3)), dtype=torch.float32)
     opacities = torch.tensor(rng.choice(draw(st.sampled_from([[0.0], [1.0], [0.0, 0.004, 0.3, 1.0]])), num)).float()
-    cfg = DensityConfig(
-        max_gaussians=draw(st.sampled_from([1, 20, 45, 200_000])),
-        prune_max_scale_mm=draw(st.sampled_from([0.0, 40.0])),
-        prior_prune=draw(st.booleans()),
-        extent_mode=draw(st.sampled_from(["camera", "scene"])),
-        unobserved_score=draw(st.sampled_from([0.0, 1.0])),
-    )
+    cfg = DensityConfig(min_densify_weight=draw(st.sampled_from([0.35, 1.0])))
+    largest = draw(st.sampled_from([0.0, 40.0]))
+    released = ReleasedMethod(prior=draw(st.booleans()), prune_max_scale_mm=largest)
     extent = draw(st.sampled_from([0.0, 1.0, 1e6, math.inf]))
-    return stats, scales, opacities, extent, cfg
+    return stats, scales, opacities, extent, cfg, released
 
 
-@given(states())
-def test_a_plan_is_disjoint_and_never_grows_beyond_the_limit(made):
-    stats, scales, opacities, _, cfg = made
-    planned = density.plan(*made)
+@given(states(), st.sampled_from([1, 20, 45, 200_000]))
+def test_a_plan_is_disjoint_and_never_grows_beyond_the_limit(made, limit):
+    stats, scales, opacities, _, cfg, released = made
+    with mock.patch.object(density, "MAX_GAUSSIANS", limit):
+        planned = density.plan(*made)
     num, sets = len(scales), (planned.clone, planned.split, planned.remove)
     assert all(s.shape == (num,) and s.dtype == torch.bool for s in sets)
     assert (sum(s.int() for s in sets) <= 1).all()
     after = num + int(planned.clone.sum()) + int(planned.split.sum()) - int(planned.remove.sum())
-    assert 0 <= after <= max(num, cfg.max_gaussians)
+    assert 0 <= after <= max(num, limit)
     assert (planned.remove | ~(opacities < cfg.prune_opacity)).all()  # the faint always go
     still = (stats.grad2d_ndc_sum == 0) & (stats.num_seen > 0)
     assert not (planned.clone[still].any() or planned.split[still].any())
-    score = stats.score(cfg.unobserved_score)
+    score = stats.score(released.unobserved_score)
     assert torch.isfinite(score).all() and (score >= 0).all() and (score <= 1).all()
 
 
 @given(states(), SEEDS)
 def test_a_plan_does_not_depend_on_the_order(made, seed):
-    stats, scales, opacities, extent, cfg = made
+    stats, scales, opacities, extent, *rules = made
     order = torch.randperm(len(scales), generator=torch.Generator().manual_seed(seed))
     want = density.plan(*made)
     mixed = DensityStats(*(value[order] for value in stats.tensors().values()))
-    got = density.plan(mixed, scales[order], opacities[order], extent, cfg)
+    got = density.plan(mixed, scales[order], opacities[order], extent, *rules)
     assert all(torch.equal(getattr(got, name), getattr(want, name)[order]) for name in ("clone", "split", "remove"))
 
 
 @given(states())
 def test_an_infinite_gradient_or_none_at_all_makes_no_one_vanish(made):
     """Statistics that are no numbers move nobody; growth by infinity is growth."""
-    stats, scales, opacities, extent, cfg = made
+    stats, scales, opacities, extent, *_ = made
     solid = torch.ones_like(opacities)
-    cfg = replace(cfg, prune_max_scale_mm=0.0, prior_prune=False)
+    cfg = DensityConfig(min_densify_weight=1.0)
     for value, grows in ((math.nan, False), (math.inf, True)):
         odd = replace(stats, grad2d_ndc_sum=torch.full_like(opacities, value), num_seen=torch.ones_like(opacities))
-        planned = density.plan(odd, scales, solid, extent, replace(cfg, max_gaussians=10**6))
+        planned = density.plan(odd, scales, solid, extent, cfg)
         assert not planned.remove.any()
         assert ((planned.clone | planned.split) == grows).all()
 
@@ -89,13 +88,13 @@ def test_an_infinite_gradient_or_none_at_all_makes_no_one_vanish(made):
 @examples(20)
 @given(states(), st.sampled_from([0, 3]))
 def test_an_applied_plan_gives_the_planned_number_of_finite_gaussians(made, degree):
-    stats, scales, _, extent, cfg = made
-    num, config = len(scales), replace(Config(), density=cfg)
+    stats, scales, _, extent, *rules = made
+    num, config = len(scales), preset("paper")
     config = replace(config, schedule=replace(config.schedule, sh_degree=degree))
     rng = np.random.default_rng(num)
     gaussians = create_gaussians(rng.normal(size=(num, 3)), rng.random((num, 3)), scales.amax(-1).log().numpy(), config)
     optimizer = Optimizer(gaussians, None, config, partial(rate_of, cfg=config, spatial_scale=1.0), NUMBA)
-    planned = density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg)
+    planned = density.plan(stats, gaussians.scales, gaussians.opacities, extent, *rules)
     new, _ = apply_plan(optimizer, planned, stats, rng)
     after = num + int(planned.clone.sum()) + int(planned.split.sum()) - int(planned.remove.sum())
     assert len(gaussians) == after
@@ -138,14 +137,12 @@ def test_gradients_of_what_was_not_drawn_are_not_looked_at(seed, num):
     assert torch.isfinite(stats.grad2d_ndc_sum).all() and torch.equal(stats.num_seen, radii.float())
 
 
-@given(SEEDS, st.integers(0, 30), st.sampled_from(["camera", "scene"]), st.sampled_from([0.0, 1e-30, 1.0, 1e15]))
-def test_extent_is_a_length_and_moves_with_nothing(seed, num, mode, size):
-    rng = np.random.default_rng(seed)
-    points, cfg = torch.tensor(rng.normal(size=(num, 3)) * size), DensityConfig(extent_mode=mode)
-    centers = torch.zeros(2, 3, dtype=torch.float64)
-    extent = density.scene_extent(centers, points, cfg)
+@given(SEEDS, st.integers(1, 30), st.sampled_from([0.0, 1e-30, 1.0, 1e15]))
+def test_extent_is_a_length_and_moves_with_nothing(seed, num, size):
+    centers = torch.tensor(np.random.default_rng(seed).normal(size=(num, 3)) * size)
+    extent = density.scene_extent(centers)
     assert extent >= 0 and math.isfinite(extent)
-    if mode == "camera" or num < 2:
+    if num < 2:
         assert extent == 0.0
     elif size:
-        assert density.scene_extent(centers, points + 3 * size, cfg) == pytest.approx(extent, rel=1e-6)
+        assert density.scene_extent(centers + 3 * size) == pytest.approx(extent, rel=1e-6)

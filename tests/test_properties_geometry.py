@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from endoprior.compute.morton import morton_order
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, expected_depth, pixel_centers, project, quaternion_to_matrix
 from endoprior.data.pixels import shrunk_camera
+from endoprior.model import motion
 from endoprior.model.motion import basis_weights
 from endoprior.training.temporal_numba import neighbors
 
@@ -112,7 +114,8 @@ def test_a_shrunk_camera_keeps_its_field_of_view_up_to_what_was_cut_off(width, h
 
 @given(st.integers(2, 60), st.floats(0, 1), st.floats(0.2, 5))
 def test_bumps_over_time_are_between_0_and_1(num, time, width):
-    weights = basis_weights(time, BasisConfig(num_bases=num, relative_width=width))
+    with mock.patch.object(motion, "RELATIVE_WIDTH", width):
+        weights = basis_weights(time, BasisConfig(num_bases=num))
     assert weights.shape == (num,) and ((weights >= 0) & (weights <= 1)).all()
     if width >= 1:
         assert weights.max() > 0.3  # no moment is out of reach

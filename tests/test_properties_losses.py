@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -74,10 +74,10 @@ def test_a_perfect_picture_of_one_color_costs_nothing(made):
     assert terms.abs().max() < 1e-6
 
 
-def with_torch(now, before, indices, pair_weights, cfg):
+def with_torch(now, before, indices, pair_weights, smooth_l1):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal.local_motion(now, before, indices, pair_weights, cfg)
+    return temporal.local_motion(now, before, indices, pair_weights, smooth_l1)
 
 
 @st.composite
@@ -96,9 +96,8 @@ def clouds(draw):
 
 
 @examples(30)
-@given(clouds(), st.integers(1, 8), st.sampled_from(["literal", "released"]), SEEDS)
-def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, huber, seed):
-    cfg = replace(TemporalConfig(), huber_scale=huber)
+@given(clouds(), st.integers(1, 8), st.booleans(), SEEDS)
+def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, smooth_l1, seed):
     if k >= len(points):
         with pytest.raises(ValueError, match="k must be in"):
             temporal_numba.neighbors(points, k)
@@ -112,7 +111,7 @@ def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, huber
     results = []
     for function in (temporal_numba.local_motion, with_torch):
         now, before = (torch.tensor(p).requires_grad_() for p in (moved, points))
-        terms = function(now, before, indices, pair_weights, cfg)
+        terms = function(now, before, indices, pair_weights, smooth_l1)
         sum(terms).backward()
         assert all(torch.isfinite(t) and t >= 0 for t in terms)
         assert torch.isfinite(now.grad).all() and torch.isfinite(before.grad).all()
@@ -131,13 +130,11 @@ def test_what_moves_as_one_costs_nothing(points, seed):
     shift = np.random.default_rng(seed).normal(size=3) * size
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     before = torch.tensor(points)
-    displacement, distance = temporal_numba.local_motion(
-        before + torch.tensor(shift), before, indices, pair_weights, TemporalConfig()
-    )
+    displacement, distance = temporal_numba.local_motion(before + torch.tensor(shift), before, indices, pair_weights)
     assert displacement == pytest.approx(1e-4, abs=1e-6 + 1e-9 * size)
     turned = torch.tensor(points @ turn.T + shift)
     assert distance < 1e-9 * (1 + size)
-    assert temporal_numba.local_motion(turned, before, indices, pair_weights, TemporalConfig())[1] < 1e-9 * (1 + size)
+    assert temporal_numba.local_motion(turned, before, indices, pair_weights)[1] < 1e-9 * (1 + size)
 
 
 @given(SEEDS, st.integers(0, 300), st.integers(1, 100), st.sampled_from([0.0, -300.0, 30.0]))
@@ -152,9 +149,10 @@ def test_chosen_gaussians_are_distinct_and_have_weight(seed, num, count, exponen
 
 @given(SEEDS, st.integers(0, 300), st.sampled_from([1e-5, 0.08, 10.0]), st.booleans())
 def test_motion_weights_are_in_0_to_1_and_rise_with_the_score(seed, num, temperature, adaptive):
-    cfg = TemporalConfig(motion_temperature=temperature, adaptive_motion_weight=adaptive)
+    cfg = TemporalConfig(gradient="both")
     score = np.sort(np.random.default_rng(seed).random(num)).astype(np.float32)
-    weights = temporal.relaxed_motion_weight(score, cfg)
+    with mock.patch.object(temporal, "MOTION_TEMPERATURE", temperature):
+        weights = temporal.kept_motion_weight(score, adaptive)
+        chosen, taken = temporal.choose(score, np.ones(num, bool), cfg, adaptive)
     assert ((weights >= 0) & (weights <= 1)).all() and (np.diff(weights) >= 0).all()
-    chosen, taken = temporal.choose(score, np.ones(num, bool), cfg)
     assert len(chosen) == len(taken) and (len(chosen) == 0 or len(chosen) >= cfg.min_points)

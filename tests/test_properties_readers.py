@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,11 +17,9 @@ from sequence_edits import describe
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
-from endoprior.data import load_sequence
+from endoprior.data import load_sequence, pixels
 from endoprior.data.pixels import is_measured
 from endoprior.data.writer import SequenceMeta, new_sequence
-
-UNCLIPPED = DataConfig(depth_clip_low_percentile=0, depth_clip_high_percentile=100)
 
 
 @st.composite
@@ -69,8 +68,8 @@ def stored_depth(depth, scale):
 @given(recordings())
 def test_what_was_written_is_read(made):
     meta, frames, poses = made
-    with TemporaryDirectory() as place:
-        sequence = load_sequence(written(Path(place) / "sequence", *made), UNCLIPPED)
+    with TemporaryDirectory() as place, mock.patch.object(pixels, "CLIP_PERCENTILES", (0, 100)):
+        sequence = load_sequence(written(Path(place) / "sequence", *made))
         assert len(sequence) == len(frames) and sequence.frames_per_second == meta.frames_per_second
         for i, (rgb, tool, depth) in enumerate(frames):
             frame = sequence.frame(i)
@@ -92,7 +91,7 @@ def test_polarity_stride_and_shrink_change_what_they_say(made, stride, shrink):
     with TemporaryDirectory() as place:
         folder = written(Path(place) / "sequence", *made)
         describe(folder, mask_tool_value=0)
-        cfg = DataConfig(depth_clip_low_percentile=0, depth_clip_high_percentile=100, stride=stride, shrink=shrink)
+        cfg = DataConfig(stride=stride, shrink=shrink)
         left = -(-len(frames) // stride)
         if left < 2 or min(meta.width, meta.height) < shrink:
             with pytest.raises(InputError, match="expected at least 2 frames of 1x1 px"):
@@ -136,8 +135,8 @@ def test_exactly_the_unusable_is_rejected(made):
 def test_cleaned_depth_stays_within_what_was_measured(made, one, other, lift):
     meta, frames, _ = made
     low, high = sorted((one, other))
-    cfg = DataConfig(depth_clip_low_percentile=low, depth_clip_high_percentile=high, lift_missing_depth=lift)
-    with TemporaryDirectory() as place:
+    cfg = DataConfig(lift_missing_depth=lift)
+    with TemporaryDirectory() as place, mock.patch.object(pixels, "CLIP_PERCENTILES", (low, high)):
         sequence = load_sequence(written(Path(place) / "sequence", *made), cfg)
         for i, (_, _, depth) in enumerate(frames):
             frame, want = sequence.frame(i), stored_depth(depth, meta.depth_scale)

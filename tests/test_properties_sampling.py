@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import InitConfig, PriorConfig
+from endoprior.core.config import InitConfig, ReleasedMethod
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
@@ -39,12 +39,10 @@ def configs(draw):
     return InitConfig(
         sampler=draw(st.sampled_from(["prior", "uniform", "pool"])),
         budget=draw(st.integers(1, 400)),
-        uniform_fraction=draw(st.sampled_from([0.0, 0.45, 1.0])),
-        erosion_px=draw(st.sampled_from([1, 3, 9])),
-        pool_fraction=draw(st.sampled_from([0.0, 0.01, 1.0])),
-        cleanup=draw(st.booleans()),
-        pixel_offset=draw(st.sampled_from(["exact", "legacy"])),
     )
+
+
+RELEASED = st.builds(ReleasedMethod, prior=st.booleans(), cleanup=st.booleans(), half_pixel_shift=st.booleans())
 
 
 def most_points(usable, cfg):
@@ -54,35 +52,35 @@ def most_points(usable, cfg):
     return sum(min(int(mask.sum()), share) for mask, share in zip(usable, quotas(cfg.budget, len(usable)), strict=True))
 
 
-def usable_pixels(clip, cfg):
+def usable_pixels(clip, cfg, released):
     """(H, W) bool of each frame."""
-    return [pixel_probability(frame, cfg, PriorConfig()) > 0 for frame in clip]
+    return [pixel_probability(frame, cfg, released.prior) > 0 for frame in clip]
 
 
-@given(clips(), configs(), SEEDS)
-def test_a_clip_gives_its_budget_of_finite_points_or_one_line(clip, cfg, seed):
-    most = most_points(usable_pixels(clip, cfg), cfg)
+@given(clips(), configs(), RELEASED, SEEDS)
+def test_a_clip_gives_its_budget_of_finite_points_or_one_line(clip, cfg, released, seed):
+    most = most_points(usable_pixels(clip, cfg, released), cfg)
     try:
-        cloud = initial_points(clip, cfg, seed=seed)
+        cloud = initial_points(clip, cfg, released, seed)
     except InputError as refusal:
         message = str(refusal)
         assert message.startswith("initialization: expected at least 4 tissue pixels with depth")
-        assert "\n" not in message and (cfg.cleanup or most < 4)
+        assert "\n" not in message and (released.cleanup or most < 4)
         return
-    assert 4 <= len(cloud) <= most <= cfg.budget and (cfg.cleanup or len(cloud) == most)
+    assert 4 <= len(cloud) <= most <= cfg.budget and (released.cleanup or len(cloud) == most)
     assert cloud.points.dtype == np.float32 and np.isfinite(cloud.points).all()
     assert (cloud.colors >= 0).all() and (cloud.colors <= 1).all()
     assert np.isfinite(initial_log_scales(cloud.points)).all()
-    again = initial_points(clip, cfg, seed=seed)
+    again = initial_points(clip, cfg, released, seed)
     assert all(np.array_equal(getattr(cloud, name), getattr(again, name)) for name in ("points", "colors", "origins"))
 
 
-@given(clips(), configs(), SEEDS)
-def test_points_lie_on_usable_pixels_of_their_own_frame(clip, cfg, seed):
-    cfg, usable = replace(cfg, cleanup=False), usable_pixels(clip, cfg)
+@given(clips(), configs(), RELEASED, SEEDS)
+def test_points_lie_on_usable_pixels_of_their_own_frame(clip, cfg, released, seed):
+    released, usable = replace(released, cleanup=False), usable_pixels(clip, cfg, released)
     assume(most_points(usable, cfg) >= 4)
-    cloud = initial_points(clip, cfg, seed=seed)
-    shares, offset = quotas(cfg.budget, len(clip)), 0.5 if cfg.pixel_offset == "legacy" else 0.0
+    cloud = initial_points(clip, cfg, released, seed)
+    shares, offset = quotas(cfg.budget, len(clip)), 0.5 if released.half_pixel_shift else 0.0
     for position, frame in enumerate(clip):
         own = cloud.origins == position
         if cfg.sampler != "pool":
@@ -168,7 +166,7 @@ def test_initial_motion_is_finite_for_any_images(count, height, width, seed, kin
         depth[rng.random((height, width)) < 0.3] = rng.choice([0.0, 1e-4, 1e20, 3e38])
         mask = rng.random((height, width)) < 0.8
         found.append(Frame(i, i / count, camera, picture, mask, depth, depth > 0))
-    cloud = initial_points(found, InitConfig(budget=50, erosion_px=1), seed=seed)
+    cloud = initial_points(found, InitConfig(budget=50), seed=seed)
     motion = initial_motion(found, cloud, BasisConfig(num_bases=5)).coefficients
     assert motion.shape == (len(cloud), 5, 3) and np.isfinite(motion).all()
     assert kind != "still" or count > 1 or (motion == 0).all()

@@ -128,7 +128,7 @@ def test_neighbor_terms_by_hand():
 
 
 def test_the_loss_by_hand(tiny_sequence):
-    frames = TrainingFrames(load_sequence(tiny_sequence), CFG.prior)
+    frames = TrainingFrames(load_sequence(tiny_sequence))
     frame = frames.frame(0)
     depth = frame.depth
     out = RenderOutput(frame.rgb + 0.1, torch.ones_like(depth), depth + 5, torch.zeros(1, 2), torch.zeros(1))

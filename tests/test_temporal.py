@@ -1,34 +1,31 @@
 """Temporal term, Eqs. (9)-(11): literal loops, invariances, gradients, sampling."""
 
-from dataclasses import replace
-
 import numba
 import numpy as np
 import pytest
 import torch
 from reference import temporal as reference
 
-from endoprior.core.config import TemporalConfig
 from endoprior.model.presets import preset
 from endoprior.training import temporal, temporal_numba
 
-CFG = TemporalConfig()
+CFG = preset("paper").temporal
 
 
 def points(num=40, seed=0):
     return np.random.default_rng(seed).uniform(-10, 10, (num, 3))
 
 
-def with_torch(now, before, indices, pair_weights, cfg):
+def with_torch(now, before, indices, pair_weights, smooth_l1=False):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal.local_motion(now, before, indices, pair_weights, cfg)
+    return temporal.local_motion(now, before, indices, pair_weights, smooth_l1)
 
 
-def loss(now, before, weights=None, cfg=CFG):
-    indices, distances = temporal_numba.neighbors(before.detach().numpy(), cfg.num_neighbors)
+def loss(now, before, weights=None):
+    indices, distances = temporal_numba.neighbors(before.detach().numpy(), temporal.NUM_NEIGHBORS)
     weights = np.ones(len(before)) if weights is None else weights
-    return temporal_numba.local_motion(now, before, indices, temporal_numba.affinity(distances, indices, weights), cfg)
+    return temporal_numba.local_motion(now, before, indices, temporal_numba.affinity(distances, indices, weights))
 
 
 def test_motion_weight_is_half_at_the_threshold():
@@ -38,19 +35,19 @@ def test_motion_weight_is_half_at_the_threshold():
 def test_relaxation_lowers_the_threshold_until_enough_count():
     score = np.full(1000, 0.1)
     score[:20] = 0.9
-    fixed = temporal.relaxed_motion_weight(score, CFG)
-    relaxed = temporal.relaxed_motion_weight(score, replace(CFG, adaptive_motion_weight=True))
-    assert temporal.effective_size(relaxed) >= CFG.min_effective > temporal.effective_size(fixed)
+    fixed = temporal.kept_motion_weight(score)
+    relaxed = temporal.kept_motion_weight(score, relaxed=True)
+    assert temporal.effective_size(relaxed) >= temporal.MIN_EFFECTIVE > temporal.effective_size(fixed)
 
 
 def test_relaxation_stops_at_its_floor():
-    weights = temporal.relaxed_motion_weight(np.zeros(10), replace(CFG, adaptive_motion_weight=True))
+    weights = temporal.kept_motion_weight(np.zeros(10), relaxed=True)
     # After eight tries: threshold 0.25, temperature 0.30.
     assert weights == pytest.approx(temporal.motion_weight(np.zeros(10), 0.25, 0.30))
 
 
 def test_weights_up_to_the_least_one_are_dropped():
-    assert temporal.relaxed_motion_weight(np.array([-1.0]), CFG)[0] == 0
+    assert temporal.kept_motion_weight(np.array([-1.0]))[0] == 0
 
 
 def test_systematic_sample_takes_all_when_they_fit():
@@ -75,10 +72,11 @@ def test_a_refilled_sample_is_the_literal_loop():
     assert len(temporal.systematic_sample(weights, 60)) < 60
 
 
-def test_relaxation_evaluates_eight_times():
+def test_relaxation_evaluates_eight_times(monkeypatch):
     score = np.linspace(0, 1, 30)  # thirty are never 256
-    steep = replace(CFG, adaptive_motion_weight=True, motion_threshold=0.9, motion_temperature=0.01)
-    weights = temporal.relaxed_motion_weight(score, steep)
+    monkeypatch.setattr(temporal, "MOTION_THRESHOLD", 0.9)
+    monkeypatch.setattr(temporal, "MOTION_TEMPERATURE", 0.01)
+    weights = temporal.kept_motion_weight(score, relaxed=True)
     seven_steps = temporal.motion_weight(score, 0.9 - 7 * 0.05, 0.01 * 1.5**7)
     np.testing.assert_allclose(weights, np.where(seven_steps > 1e-4, seven_steps, 0), rtol=1e-9)
     np.testing.assert_allclose(weights, reference.relaxed_weights(score.tolist(), 256, 0.9, 0.01), rtol=1e-9)
@@ -90,8 +88,8 @@ def test_only_candidates_count_for_the_relaxation():
     score, eligible = rng.beta(2, 8, 3000), rng.random(3000) < 0.5
     score[~eligible] = 1
     cfg = preset("released").temporal
-    chosen, weights = temporal.choose(score, eligible, cfg)
-    alone, want = temporal.choose(score[eligible], np.ones(eligible.sum(), bool), cfg)
+    chosen, weights = temporal.choose(score, eligible, cfg, True)
+    alone, want = temporal.choose(score[eligible], np.ones(eligible.sum(), bool), cfg, True)
     assert chosen.tolist() == np.flatnonzero(eligible)[alone].tolist() and len(chosen) == 1024
     np.testing.assert_array_equal(weights, want)
     relaxed = reference.relaxed_weights(score[eligible].tolist(), 256, 0.45, 0.08)
@@ -134,7 +132,7 @@ def test_loss_is_the_literal_double_loop():
     weights = np.random.default_rng(3).uniform(0.2, 1, 20)
     indices, distances = temporal_numba.neighbors(before, 8)
     pair = temporal_numba.affinity(distances, indices, weights)
-    got = temporal_numba.local_motion(torch.from_numpy(now), torch.from_numpy(before), indices, pair, CFG)
+    got = temporal_numba.local_motion(torch.from_numpy(now), torch.from_numpy(before), indices, pair)
     # The root's 1e-8 mm^2 adds less than 1e-9 to displacements of millimeters.
     assert [term.item() for term in got] == pytest.approx(reference.local_motion(now, before, indices, pair), rel=1e-7)
 
@@ -158,18 +156,19 @@ def test_a_rigid_motion_costs_no_distance():
 
 def test_released_huber_is_the_literal_one_over_delta():
     x = torch.tensor([0.0, 0.003, 0.01, 0.5])
-    literal, scaled = temporal.huber(x, 0.01, "literal"), temporal.huber(x, 0.01, "released")
+    literal, scaled = temporal.huber(x, 0.01), temporal.huber(x, 0.01, smooth_l1=True)
     assert literal.tolist() == pytest.approx([0, 4.5e-6, 5e-5, 0.01 * 0.495])
     torch.testing.assert_close(scaled, literal / 0.01)
 
 
-def test_gradient_against_central_differences():
+def test_gradient_against_central_differences(monkeypatch):
+    monkeypatch.setattr(temporal_numba, "HUBER_DELTA", 2.0)
     now, before = (torch.from_numpy(points(15, seed)).requires_grad_() for seed in (5, 6))
     indices, distances = temporal_numba.neighbors(before.detach().numpy(), 8)
     pair = temporal_numba.affinity(distances, indices, np.ones(15))
 
     def terms(a, b):
-        return temporal_numba.local_motion(a, b, indices, pair, replace(CFG, huber_delta=2.0))
+        return temporal_numba.local_motion(a, b, indices, pair)
 
     assert torch.autograd.gradcheck(terms, (now, before), eps=1e-6, atol=1e-6)
 
@@ -190,21 +189,20 @@ def motion(num=600, seed=0, dtype=torch.float32):
     return now, before, indices, temporal_numba.affinity(distances, indices, rng.uniform(0.1, 1, num))
 
 
-def loss_and_gradients(function, now, before, indices, pair, cfg, upstream=(2.0, -3.0)):
+def loss_and_gradients(function, now, before, indices, pair, smooth_l1=False, upstream=(2.0, -3.0)):
     now, before = now.clone().requires_grad_(), before.clone().requires_grad_()
-    terms = function(now, before, indices, pair, cfg)
+    terms = function(now, before, indices, pair, smooth_l1)
     gradients = torch.autograd.grad(upstream[0] * terms[0] + upstream[1] * terms[1], (now, before))
     return *(t.detach() for t in terms), *gradients
 
 
 # In float32 the change of a length is the difference of two roots near 1 mm: 1e-7 mm of error in changes of 0.01 mm.
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float32, 1e-4), (torch.float64, 1e-11)])
-@pytest.mark.parametrize("scale", ["literal", "released"])
-def test_fused_loss_and_gradient_are_those_of_the_torch_implementation(dtype, rtol, scale):
-    cfg = replace(CFG, huber_scale=scale)
+@pytest.mark.parametrize("smooth_l1", [False, True])
+def test_fused_loss_and_gradient_are_those_of_the_torch_implementation(dtype, rtol, smooth_l1):
     now, before, indices, pair = motion(dtype=dtype)
-    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, cfg)
-    want = loss_and_gradients(with_torch, now.double(), before.double(), indices, pair, cfg)
+    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, smooth_l1)
+    want = loss_and_gradients(with_torch, now.double(), before.double(), indices, pair, smooth_l1)
     for g, w in zip(got[:2], want[:2], strict=True):
         assert g.dtype == dtype and g.item() == pytest.approx(w.item(), rel=min(rtol, 1e-5))
     for g, w in zip(got[2:], want[2:], strict=True):
@@ -215,25 +213,25 @@ def test_fused_loss_and_gradient_are_those_of_the_torch_implementation(dtype, rt
 def test_a_point_that_is_everybodys_neighbor_gets_all_their_pulls():
     now, before, indices, pair = motion(dtype=torch.float64)
     indices[1:, 3] = 0
-    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, CFG)
-    want = loss_and_gradients(with_torch, now, before, indices, pair, CFG)
+    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair)
+    want = loss_and_gradients(with_torch, now, before, indices, pair)
     for g, w in zip(got, want, strict=True):
         torch.testing.assert_close(g, w, rtol=1e-10, atol=1e-14)
 
 
 def test_only_the_end_that_wants_a_gradient_gets_one():
     now, before, indices, pair = motion()
-    both = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, CFG, (1.0, 1.0))
+    both = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, upstream=(1.0, 1.0))
     for wanted in (0, 1):
         ends = [now.clone(), before.clone()]
         ends[wanted].requires_grad_()
-        sum(temporal_numba.local_motion(*ends, indices, pair, CFG)).backward()
+        sum(temporal_numba.local_motion(*ends, indices, pair)).backward()
         assert torch.equal(ends[wanted].grad, both[2 + wanted]) and ends[1 - wanted].grad is None
-    assert not temporal_numba.local_motion(now, before, indices, pair, CFG)[0].requires_grad
+    assert not temporal_numba.local_motion(now, before, indices, pair)[0].requires_grad
 
 
 def test_pulls_within_the_cloud_cancel():
-    _, _, on_now, on_before = loss_and_gradients(temporal_numba.local_motion, *motion(dtype=torch.float64), CFG)
+    _, _, on_now, on_before = loss_and_gradients(temporal_numba.local_motion, *motion(dtype=torch.float64))
     for gradient in (on_now, on_before):  # the loss does not change when one end moves as a whole
         assert gradient.sum(0).abs().max() < 1e-12 < gradient.abs().max()
 
@@ -247,7 +245,7 @@ def test_the_number_of_threads_changes_no_bit():
             results.append(
                 (
                     torch.from_numpy(pair),
-                    *loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, CFG),
+                    *loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair),
                 )
             )
     finally:
@@ -274,10 +272,10 @@ def test_a_point_at_nan_shows():
 def test_what_does_not_fit_together_is_an_error():
     now, before, indices, pair = motion()
     with pytest.raises(ValueError, match="before must have shape"):
-        temporal_numba.local_motion(now, before[:-1], indices, pair, CFG)
+        temporal_numba.local_motion(now, before[:-1], indices, pair)
     with pytest.raises(ValueError, match="before must have the type"):
-        temporal_numba.local_motion(now, before.double(), indices, pair, CFG)
+        temporal_numba.local_motion(now, before.double(), indices, pair)
     for wrong in (-1, len(now)):
         indices[3, 2] = wrong
         with pytest.raises(ValueError, match="indices must be in"):
-            temporal_numba.local_motion(now, before, indices, pair, CFG)
+            temporal_numba.local_motion(now, before, indices, pair)

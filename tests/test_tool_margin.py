@@ -231,7 +231,7 @@ def test_their_colors_do_not_matter(make_tiny_sequence):
         CFG,
         init=replace(CFG.init, sampler="pool"),
         temporal=replace(CFG.temporal, weight=0.0),
-        density=replace(CFG.density, prior_prune=False, min_densify_weight=1.0),
+        density=replace(CFG.density, min_densify_weight=1.0),
     )
     # Corners of the ring are farther than 1 px from the tool: a plus, not a square, is left out.
     scenes = []

@@ -11,8 +11,8 @@ import torch
 from conftest import write_tiny_sequence
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config, InitConfig
-from endoprior.core.config_deformation import BasisConfig
+from endoprior.core.config import Config
+from endoprior.core.config_deformation import BasisConfig, DeformationConfig
 from endoprior.core.geometry import back_project, bilinear, project
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
@@ -243,4 +243,4 @@ def test_training_starts_along_the_tracks(tmp_path):
 
 def test_only_the_basis_can_start_along_tracks():
     with pytest.raises(InputError, match=r"init\.motion: expected rest with deformation\.kind hexplane[;,] got flow"):
-        Config(init=InitConfig(motion="flow"))
+        Config(deformation=DeformationConfig(kind="hexplane"))

@@ -15,7 +15,7 @@ from tiny_training import KINDS, losses_of, tiny_config
 
 from endoprior.compute.morton import morton_order
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config, DataConfig
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.export import export
 from endoprior.export.formats import ExportOptions
@@ -134,7 +134,7 @@ def test_eligible_frames_of_the_temporal_term(make_tiny_sequence):
 
     for frames, train_frames, eligible in ((63, 55, 46), (156, 136, 115)):
         sequence = load_sequence(make_tiny_sequence(str(frames), num_frames=frames, width=16, height=16))
-        views = TrainingFrames(sequence, Config().prior)
+        views = TrainingFrames(sequence)
         assert len(views) == train_frames
         assert sum(views.before(k) is not None for k in range(len(views))) == eligible
 

@@ -16,7 +16,7 @@ from endoprior.training.preflight import LEAST_BYTES, PICTURE_BYTES, least_bytes
 def test_by_hand():
     cfg = tiny_config("basis").fitted(17)  # 300 Gaussians of degree 3, `num_bases` bumps
     per_gaussian = 3 + 4 + 3 + 1 + 3 * 16
-    channels = 3 + 4 + 3 + 3 * cfg.deformation.basis.deform_color + cfg.deformation.deform_opacity
+    channels = 3 + 4 + 3 + 3 + cfg.deformation.deform_opacity
     motion = cfg.deformation.basis.num_bases * channels
     state = 3 * 4 * 300 * (per_gaussian + motion) + 2 * 4 * 300 * motion
     assert least_bytes(cfg, 300, 15, 48, 40) - LEAST_BYTES - PICTURE_BYTES * 48 * 40 >= state

@@ -16,7 +16,7 @@ from tiny_training import tiny_config
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DataConfig, WindowConfig
 from endoprior.core.types import Camera, Splats
-from endoprior.data import load_sequence
+from endoprior.data import load_sequence, window_plan
 from endoprior.data.window_plan import Looks, look_through, plan_windows
 from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.colors import with_fixed_color
@@ -33,7 +33,7 @@ from endoprior.runs.train import start_run, train
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
-RULES = WindowConfig(enabled=True, shortest=10, longest=40, overlap=4)
+LONGEST, SHORTEST, OVERLAP = 40, 10, 4
 SPEED_MM = 0.4
 """Per frame, to the right."""
 
@@ -120,18 +120,20 @@ def three() -> WindowedScene:
         "a little too long",
     ],
 )
-def test_where_a_sequence_is_cut(cameras, seen, starts):
-    plan = plan_windows(cameras, seen, RULES)
+def test_where_a_sequence_is_cut(cameras, seen, starts, monkeypatch):
+    monkeypatch.setattr(window_plan, "SHORTEST", SHORTEST)
+    monkeypatch.setattr(window_plan, "OVERLAP", OVERLAP)
+    plan = plan_windows(cameras, seen, LONGEST)
     assert [start for start, _ in plan] == starts
     assert plan[-1][1] == len(cameras)
-    assert all(stop == following + RULES.overlap for (_, stop), (following, _) in pairwise(plan))
-    assert all(RULES.shortest <= stop - start <= RULES.longest for start, stop in plan)
-    assert plan_windows(cameras, seen, replace(RULES, enabled=False)) == [(0, len(cameras))]
+    assert all(stop == following + OVERLAP for (_, stop), (following, _) in pairwise(plan))
+    assert all(SHORTEST <= stop - start <= LONGEST for start, stop in plan)
+    assert plan_windows(cameras, seen, 0) == [(0, len(cameras))]
 
 
 def test_without_depth_only_turns_pictures_and_length_cut():
     cameras = [camera_at(x_mm=5.0 * i) for i in range(36)]
-    assert plan_windows(cameras, replace(looks(36), depth_mm=np.full(36, np.nan)), RULES) == [(0, 36)]
+    assert plan_windows(cameras, replace(looks(36), depth_mm=np.full(36, np.nan)), LONGEST) == [(0, 36)]
 
 
 def test_held_out_frames_do_not_decide_where_to_cut(make_tiny_sequence):
@@ -289,7 +291,7 @@ def test_a_window_that_is_no_range_of_frames(make_tiny_sequence, window):
 
 
 def in_windows(cfg: Config) -> Config:
-    return replace(cfg, windows=WindowConfig(enabled=True, shortest=6, longest=10, overlap=3))
+    return replace(cfg, windows=WindowConfig(longest=10))
 
 
 @pytest.fixture(scope="module")
@@ -306,10 +308,10 @@ def trained(tmp_path_factory) -> tuple[Path, Path]:
 def test_every_window_is_a_run_of_its_own(trained, tmp_path):
     data, run = trained
     plan = json.loads((run / "config.json").read_text())["windows"]
-    assert plan == [[0, 10], [7, 17], [14, 20]]
+    assert plan == [[0, 10], [5, 15], [10, 20]]
     cfg = tiny_config("basis")
-    alone = replace(cfg, data=replace(cfg.data, window="7-16"), windows=replace(in_windows(cfg).windows, enabled=False))
-    train(load_sequence(data, DataConfig(window="7-16")), alone, tmp_path / "alone")
+    alone = replace(cfg, data=replace(cfg.data, window="5-14"))
+    train(load_sequence(data, DataConfig(window="5-14")), alone, tmp_path / "alone")
     second = window_file(run / "scene.safetensors", 1)
     assert second.read_bytes() == (tmp_path / "alone/scene.safetensors").read_bytes()
     lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]

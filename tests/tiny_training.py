@@ -19,14 +19,15 @@ def tiny_config(kind: str, coarse: int = 6, fine: int = 14) -> Config:
     cfg = preset("released")
     deformation = replace(cfg.deformation, kind=kind)
     if kind == "hexplane":
-        planes = replace(deformation.hexplane, resolution=(8, 8, 8), time_resolution=6, channels=4, multires=(1, 2))
+        planes = replace(deformation.hexplane, time_resolution=6, channels=4, multires=(1, 2))
         deformation = replace(deformation, hexplane=planes)
     return replace(
         cfg,
         data=DataConfig(),
-        init=replace(cfg.init, budget=300, cleanup=False),
+        init=replace(cfg.init, budget=300),
+        released=replace(cfg.released, cleanup=False),
         deformation=deformation,
-        density=replace(cfg.density, start_iteration=2, every=4, grow_threshold=2e-3, score_mode="every"),
+        density=replace(cfg.density, start_iteration=2, every=4, grow_threshold=2e-3),
         temporal=replace(cfg.temporal, start_iteration=3, min_points=20, weight=1e-3),
         schedule=replace(cfg.schedule, coarse_iterations=coarse, fine_iterations=fine, sh_every=4),
     )

@@ -11,12 +11,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from endoprior.core.config import Config, DensityConfig, LossConfig, OptimConfig, ScheduleConfig, TemporalConfig
+from endoprior.core.config import Config
 from endoprior.core.types import Frame
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Field, Motion, Offsets
 from endoprior.model.ops import ModelOps
+from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod
 from endoprior.training.optimizer import Rate, rate_of
 
@@ -67,17 +68,19 @@ class Deform3DGS(GaussianMethod):
     uses_prior = False
     color_is_error = True
     first_share = SHARE
+    clone_extent = 0.0  # what grows is split
     _motion = LearnedBasisMotion()
 
     def config(self) -> Config:
         """What its preset starts from. The rates are those of 3DGS: the defaults."""
-        return Config(
-            method="deform3dgs",
-            loss=LossConfig(tv_weight=0.0),
-            temporal=TemporalConfig(weight=0.0),
-            density=DensityConfig(min_densify_weight=1.0, prior_prune=False, clone_extent=0.0),
-            optim=OptimConfig(decay_iterations=4000),
-            schedule=ScheduleConfig(coarse_iterations=0, fine_iterations=3000, sh_every=500),
+        return paper().replace(
+            {
+                "method": "deform3dgs",
+                "loss.tv_weight": 0.0,
+                "temporal.weight": 0.0,
+                "density.min_densify_weight": 1.0,
+                "schedule.coarse_iterations": 0,
+            }
         )
 
     def motion(self, cfg: Config) -> Motion:

@@ -10,14 +10,14 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from endoprior.core.config import Config, DensityConfig, OptimConfig, ScheduleConfig, TemporalConfig
-from endoprior.core.config_deformation import DeformationConfig, HexPlaneConfig
+from endoprior.core.config import Config
 from endoprior.core.types import Frame
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.hexplane_field import HexPlaneMotion
+from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
 from endoprior.model.motion import Motion
-from endoprior.training.density import DensityStats, Plan
+from endoprior.model.presets import paper
+from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
@@ -43,23 +43,40 @@ GROW_BELOW, REMOVE_ABOVE = 360_000, 200_000
 """Gaussians are added only while there are fewer, and removed only while there are more."""
 
 
+class SmallField(HexPlaneField):
+    """A wider network, and a box that stays."""
+
+    width = 64
+    learns_box = False
+
+
+class SmallMotion(HexPlaneMotion):
+    """See `SmallField`."""
+
+    field_class = SmallField
+
+
 class Endo4DGS(GaussianMethod):
     """See `GaussianMethod`."""
 
     uses_prior = False
     first_share = 1 / EVERY_PX**2
-    _motion = HexPlaneMotion()
+    _motion = SmallMotion()
 
     def config(self) -> Config:
         """What its preset starts from."""
-        planes = HexPlaneConfig(time_resolution=75, channels=32, multires=(1, 2), width=64, learn_box=False)
-        return Config(
-            method="endo4dgs",
-            deformation=DeformationConfig(hexplane=planes),
-            temporal=TemporalConfig(weight=0.0),
-            density=DensityConfig(stop_iteration=1500, min_densify_weight=1.0, prior_prune=False),
-            optim=OptimConfig(decay_iterations=20_000),
-            schedule=ScheduleConfig(coarse_iterations=1000, fine_iterations=3000, sh_every=1000),
+        return paper().replace(
+            {
+                "method": "endo4dgs",
+                "deformation.hexplane.time_resolution": 75,
+                "deformation.hexplane.channels": 32,
+                "deformation.hexplane.multires": (1, 2),
+                "temporal.weight": 0.0,
+                "density.stop_iteration": 1500,
+                "density.min_densify_weight": 1.0,
+                "optim.decay_iterations": 20_000,
+                "schedule.sh_every": 1000,
+            }
         )
 
     def motion(self, cfg: Config) -> Motion:
@@ -107,8 +124,8 @@ class Endo4DGS(GaussianMethod):
         """See `GaussianMethod.plan`."""
         gradient, num = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1), len(gaussians)
         grow = gradient >= cfg.density.grow_threshold
-        grow &= num + int(grow.sum()) <= cfg.density.max_gaussians and num < GROW_BELOW
-        small = gaussians.scales.amax(-1) <= cfg.density.clone_extent * extent
+        grow &= num + int(grow.sum()) <= MAX_GAUSSIANS and num < GROW_BELOW
+        small = gaussians.scales.amax(-1) <= CLONE_EXTENT * extent
         remove = (gaussians.opacities < cfg.density.prune_opacity) & (num > REMOVE_ABOVE)
         split = grow & ~small
         return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split, removed_by={"opacity": remove})

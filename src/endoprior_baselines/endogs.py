@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, huber_loss
 
-from endoprior.core.config import Config, DensityConfig, InitConfig, OptimConfig, ScheduleConfig, TemporalConfig
-from endoprior.core.config_deformation import DeformationConfig, HexPlaneConfig
+from endoprior.core.config import Config
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Motion
-from endoprior.training.density import DensityStats, Plan
+from endoprior.model.presets import paper
+from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
-from endoprior.training.optimizer import Rate, rate_of
+from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
@@ -37,7 +37,7 @@ OFTEN_HIDDEN = 30.0
 """How much more a ray counts that a tool often hides."""
 DEPTH_WEIGHT, HUBER_DELTA, DEPTH_EPSILON = 0.5, 0.2, 1e-5
 TV_WEIGHT = 0.01
-PLANES = PlaneWeights(space=1e-3, time=1e-3, ones=2e-2)
+PLANE_WEIGHTS = PlaneWeights(space=1e-3, time=1e-3, ones=2e-2)
 PRUNE_EVERY, RESET_EVERY, FIRST_RESET = 7000, 6000, 500
 MOST_SCALE_SHARE = 0.1
 """After the opacity reset at 6,000 larger Gaussians go; share of the extent.
@@ -56,21 +56,19 @@ class EndoGS(GaussianMethod):
 
     def config(self) -> Config:
         """What its preset starts from. Published: 3,000 and 60,000 iterations."""
-        planes = HexPlaneConfig(time_resolution=75, channels=32, width=256)
-        return Config(
-            method="endogs",
-            init=InitConfig(sampler="pool"),
-            deformation=DeformationConfig(hexplane=planes),
-            temporal=TemporalConfig(weight=0.0),
-            density=DensityConfig(stop_iteration=45_000, min_densify_weight=1.0, prior_prune=False),
-            optim=OptimConfig(
-                network_lr=NETWORK_RATE,
-                network_lr_final=NETWORK_RATE,
-                planes_lr=PLANES_RATE,
-                planes_lr_final=PLANES_RATE,
-                decay_iterations=1_000_000,
-            ),
-            schedule=ScheduleConfig(coarse_iterations=1000, fine_iterations=5000, sh_every=1000),
+        return paper().replace(
+            {
+                "method": "endogs",
+                "init.sampler": "pool",
+                "deformation.hexplane.time_resolution": 75,
+                "deformation.hexplane.channels": 32,
+                "temporal.weight": 0.0,
+                "density.stop_iteration": 45_000,
+                "density.min_densify_weight": 1.0,
+                "optim.decay_iterations": 1_000_000,
+                "schedule.fine_iterations": 5000,
+                "schedule.sh_every": 1000,
+            }
         )
 
     def motion(self, cfg: Config) -> Motion:
@@ -79,7 +77,12 @@ class EndoGS(GaussianMethod):
 
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
         """See `GaussianMethod.rate`."""
-        return rate_of(name, cfg, EXTENT_MM if name in ("means", "box") else SPATIAL_SCALE)
+        if name != "box" and name != PLANES and not name.startswith("network"):
+            return rate_of(name, cfg, EXTENT_MM)
+        scale, start = EXTENT_MM if name == "box" else SPATIAL_SCALE, PLANES_RATE
+        if name.startswith("network"):
+            start = NETWORK_RATE
+        return lambda iteration: scale * log_linear(start, start, iteration, cfg.optim.decay_iterations)
 
     def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
         """See `GaussianMethod.position`."""
@@ -104,7 +107,7 @@ class EndoGS(GaussianMethod):
         }
         if drawn.stage is Stage.FINE:
             anchor = next(iter(drawn.field.parameters.values()))
-            terms["planes"] = plane_term(drawn.field.grid, PLANES, anchor)
+            terms["planes"] = plane_term(drawn.field.grid, PLANE_WEIGHTS, anchor)
         return terms
 
     def plan(
@@ -113,11 +116,11 @@ class EndoGS(GaussianMethod):
         """See `GaussianMethod.plan`: grow every time, prune seldom."""
         gradient, largest = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1), gaussians.scales.amax(-1)
         grow = gradient >= cfg.density.grow_threshold
-        small = largest <= cfg.density.clone_extent * EXTENT_MM
+        small = largest <= CLONE_EXTENT * EXTENT_MM
         faint = gaussians.opacities < cfg.density.prune_opacity
         large = (largest > MOST_SCALE_SHARE * EXTENT_MM) & (iteration > RESET_EVERY)
         remove = (faint | large) & (iteration % PRUNE_EVERY == 0)
-        if len(grow) + int(grow.sum()) > cfg.density.max_gaussians:
+        if len(grow) + int(grow.sum()) > MAX_GAUSSIANS:
             grow = torch.zeros_like(grow)
         split = grow & ~small
         rules = {"opacity": faint, "size": large}

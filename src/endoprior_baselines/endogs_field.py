@@ -30,17 +30,19 @@ OUTPUTS = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1, "sh": 4
 class JointField(HexPlaneField):
     """See the head of this file."""
 
+    width = 256
+
     @classmethod
     def layer_shapes(cls, cfg: DeformationConfig) -> dict[str, tuple[int, int]]:
         """See `HexPlaneField.layer_shapes`."""
-        width = cfg.hexplane.width
+        width = cls.width
         layers = {"trunk": (width, num_features(cfg))} | {name: (width, width) for name in ("second", "hidden")}
         return layers | {"output": (sum(OUTPUTS.values()), width)}
 
     @classmethod
-    def make_heads(cls, cfg: DeformationConfig, generator: torch.Generator) -> LinearLayers:
+    def make_heads(cls, cfg: DeformationConfig, generator: torch.Generator, zero_biases: bool) -> LinearLayers:
         """See `HexPlaneField.make_heads`."""
-        return LinearLayers(cls.layer_shapes(cfg), cfg.hexplane.bias_init, generator)
+        return LinearLayers(cls.layer_shapes(cfg), generator, zero_biases)
 
     def offsets(self, means: Tensor, time: float, ops: ModelOps) -> Offsets:
         """See `HexPlaneField.offsets`."""

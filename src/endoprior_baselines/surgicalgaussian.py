@@ -14,18 +14,19 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from endoprior.compute.neighbors import nearest
-from endoprior.core.config import Config, DensityConfig, OptimConfig, ScheduleConfig, TemporalConfig
+from endoprior.core.config import Config
 from endoprior.core.types import Frame, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Motion, Offsets
 from endoprior.model.ops import ModelOps
+from endoprior.model.presets import paper
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
-from endoprior.training.optimizer import Rate, log_linear, rate_of
+from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_linear, rate_of
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
@@ -102,12 +103,19 @@ class SurgicalGaussian(GaussianMethod):
 
     def config(self) -> Config:
         """What its preset starts from. Published: 40,000 iterations, growth before 15,000, decay over 30,000."""
-        return Config(
-            method="surgicalgaussian",
-            temporal=TemporalConfig(weight=0.0),
-            density=DensityConfig(stop_iteration=1500, grow_threshold=3e-4, min_densify_weight=1.0, prior_prune=False),
-            optim=OptimConfig(scales_lr=1e-3, decay_iterations=3000),
-            schedule=ScheduleConfig(coarse_iterations=0, fine_iterations=4000, sh_every=1000),
+        return paper().replace(
+            {
+                "method": "surgicalgaussian",
+                "temporal.weight": 0.0,
+                "density.stop_iteration": 1500,
+                "density.grow_threshold": 3e-4,
+                "density.min_densify_weight": 1.0,
+                "optim.scales_lr": 1e-3,
+                "optim.decay_iterations": 3000,
+                "schedule.coarse_iterations": 0,
+                "schedule.fine_iterations": 4000,
+                "schedule.sh_every": 1000,
+            }
         )
 
     def motion(self, cfg: Config) -> Motion:
@@ -126,9 +134,8 @@ class SurgicalGaussian(GaussianMethod):
         """See `GaussianMethod.rate`; the network has no length."""
         if not name.startswith("network"):
             return rate_of(name, cfg, UNIT_MM)
-        optim = cfg.optim
-        steps = round(NETWORK_LATER * optim.decay_iterations)
-        return lambda iteration: log_linear(optim.network_lr, optim.network_lr_final, iteration, steps)
+        steps = round(NETWORK_LATER * cfg.optim.decay_iterations)
+        return lambda iteration: log_linear(NETWORK_LR, FINAL_SHARE * NETWORK_LR, iteration, steps)
 
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         """See `GaussianMethod.terms`."""

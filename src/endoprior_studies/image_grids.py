@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from endoprior.core.config import DataConfig, PriorConfig
+from endoprior.core.config import DataConfig
 from endoprior.core.geometry import length_unit, project
 from endoprior.core.types import Camera, Frame, RenderOutput
 from endoprior.data import FrameSequence, load_sequence
@@ -147,7 +147,7 @@ def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
 def prior_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
     """The joint texture prior of the first frame, and the density of each method's projected centers there."""
     frame = sequence.frame(0)
-    rho = joint_texture_prior(frame.rgb, frame.tissue_mask, PriorConfig())
+    rho = joint_texture_prior(frame.rgb, frame.tissue_mask)
     densities = {name: center_density(scene, frame) for name, scene in scenes.items()}
     top = max(float(np.percentile(density, 99.5)) for density in densities.values())
     tiles = [_labeled(frame.rgb_u8, "input"), _labeled(colorize(rho, 0, 1), "prior")]

@@ -10,7 +10,7 @@ from endoprior.core.config_deformation import BasisConfig
 def weights(time: float, cfg: BasisConfig) -> list[float]:
     """w_b(t) = (exp(-(t - c_b)^2 / (2 s^2)) - e) / (1 - e) within three standard deviations, else 0."""
     found = []
-    sigma, end = cfg.relative_width / cfg.num_bases, math.exp(-4.5)
+    sigma, end = 1.5 / cfg.num_bases, math.exp(-4.5)
     for b in range(cfg.num_bases):
         center = b / (cfg.num_bases - 1)
         inside = abs(time - center) <= 3 * sigma

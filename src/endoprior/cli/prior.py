@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..core.config import PriorConfig
 from ..system.console import say
 from .arguments import Help, parse
 
@@ -21,7 +20,6 @@ class Prior:
     """Folder for specular/, salience/, prior/ and contact_sheet.png."""
     split: Literal["train", "test", "video"] = "video"
     """Frames to write."""
-    config: PriorConfig = field(default_factory=PriorConfig, metadata={"name": ""})
 
 
 HELP = Help(
@@ -37,5 +35,5 @@ def run(argv: list[str]) -> None:
     from ..visualization.prior_maps import write_prior_maps
 
     sequence = load_sequence(args.data)
-    sheet = write_prior_maps(sequence, args.split, args.config, args.out)
+    sheet = write_prior_maps(sequence, args.split, args.out)
     say(f"{len(sequence.indices(args.split))} frames: {args.out}\ncontact sheet: {sheet}")

@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from .checks import check_range
 from .ranges import Checked, Range
+
+FRAMES_PER_BASIS = 1.8
+"""Frames of the sequence for each basis function; 1.5 to 3.5 are best, more functions follow held-out frames worse."""
+FEWEST_BASES, MOST_BASES = 4, 1000
 
 
 @dataclass(frozen=True)
 class HexPlaneConfig(Checked):
     """Space-time feature planes and the heads that read offsets from them."""
 
-    resolution: Annotated[tuple[int, int, int], Range(2, 10_000)] = (64, 64, 64)
-    """Base cells along x, y, z."""
+    resolution: ClassVar[tuple[int, int, int]] = (64, 64, 64)
+    """Cells along x, y, z at the scale 1."""
     time_resolution: Annotated[int, Range(2, 100_000)] = 100
-    """Cells along time, at every scale."""
+    """Cells along time, at every scale. More follow faster motion, with more memory."""
     channels: Annotated[int, Range(1, 256)] = 64
-    """Feature channels of each plane."""
+    """Feature channels of each plane. More hold more detail of motion, with more memory and time."""
     multires: Annotated[tuple[int, ...], Range(1, 1000)] = (1, 2, 4, 8)
-    """Spatial scale multipliers; features of all scales are concatenated."""
-    width: Annotated[int, Range(1, 4096)] = 32
-    """Hidden width of the trunk and the heads."""
-    learn_box: bool = True
-    """Train the bounding box together with the planes, as EndoGaussian does without saying so."""
-    time_map: Literal["raw", "full"] = "raw"
-    """`raw` feeds t in [0, 1) into [-1, 1] and so uses half of each time plane; `full` maps it to the whole."""
-    bias_init: Literal["default", "zero"] = "default"
-    """Biases of trunk and heads: PyTorch's default, or zero (released code)."""
+    """Spatial scales, as multiples of 64 cells along each axis; features of all are concatenated. Larger ones hold
+    finer detail, with memory that grows with their square."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,22 +39,17 @@ class HexPlaneConfig(Checked):
 class BasisConfig(Checked):
     """One coefficient per Gaussian, temporal basis function and channel: a linear map, no network."""
 
-    num_bases: Annotated[int, Range(0, 1000)] = 31
-    """B: basis functions over time, centered evenly on [0, 1]; 0 takes one for every `frames_per_basis` frames."""
-    frames_per_basis: Annotated[float, Range(0.5, 1000)] = 1.8
-    """Frames of the sequence for each basis function, where `num_bases` is 0; there are never fewer than 4."""
-    relative_width: Annotated[float, Range(1e-3, 1e3)] = 1.5
-    """Standard deviation of a basis function in units of 1 / B."""
-    deform_color: bool = True
-    """Also let the view-independent color change with time."""
+    num_bases: Annotated[int, Range(0, MOST_BASES)] = 0
+    """Basis functions over time. More follow faster motion, and frames that were not trained on less well; 0 takes one
+    for every 1.8 frames, at least 4."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("num_bases", self.num_bases or 2, 2, 1000)
+        check_range("num_bases", self.num_bases or 2, 2, MOST_BASES)
 
     def fitted(self, num_frames: int) -> BasisConfig:
         """This config with a number of basis functions, chosen for `num_frames` if there is none yet."""
-        chosen = min(max(round(num_frames / self.frames_per_basis), 4), 1000)
+        chosen = min(max(round(num_frames / FRAMES_PER_BASIS), FEWEST_BASES), MOST_BASES)
         return self if self.num_bases else replace(self, num_bases=chosen)
 
 
@@ -65,15 +57,14 @@ class BasisConfig(Checked):
 class DeformationConfig(Checked):
     """How canonical Gaussians move."""
 
-    kind: Literal["hexplane", "basis"] = "hexplane"
-    """`hexplane`: the paper's field; `basis`: temporal coefficients per Gaussian."""
+    kind: Literal["hexplane", "basis"] = "basis"
+    """`basis`: temporal coefficients per Gaussian; `hexplane`: the paper's field."""
     hexplane: HexPlaneConfig = field(default_factory=HexPlaneConfig)
     basis: BasisConfig = field(default_factory=BasisConfig)
-    deform_scales: bool = True
-    """Let scales change with time."""
-    deform_quats: bool = True
-    """Let rotations change with time."""
-    max_scale_change: Annotated[float, Range(0, 1e6)] = 0.0
-    """Over time a scale becomes at most this many times larger or smaller; up to 1 sets no limit."""
+    deform_shape: bool = True
+    """Let scales and rotations change with time; off, Gaussians only move."""
     deform_opacity: bool = False
-    """Render the deformed opacity (released code); EndoGaussian computes it and renders the canonical one."""
+    """Let opacity change with time, as the released code does; EndoGaussian renders the canonical one."""
+    max_scale_change: Annotated[float, Range(0, 1e6)] = 2.0
+    """Over time a scale becomes at most this many times larger or smaller, and no canonical one exceeds 2.5 % of its
+    distance to the camera. Higher blurs what is seen from aside; up to 1 sets no limit."""

@@ -6,13 +6,12 @@ import dataclasses
 import functools
 import math
 import re
-import sys
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from .checks import InputError, input_error, printable, similar_name
+from .checks import InputError, input_error, similar_name
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
@@ -72,8 +71,8 @@ def _dotted_names(values: dict[str, Any], prefix: str = "") -> list[str]:
 def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     """Build a config dataclass from a nested dict. Unknown fields and wrong types are errors; missing ones default.
 
-    Fields that the class lists as FORMER_FIELDS (dotted names) are ignored; one line on stderr names them. Numbers must
-    be finite; Python's JSON reader also accepts NaN and infinity.
+    A class with `of_stored` knows fields of earlier versions too. Numbers must be finite, which Python's JSON reader
+    does not ask for.
 
     Raises:
         InputError: names the field, the expected and the actual value.
@@ -81,11 +80,8 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     if not isinstance(values, dict):
         fix = "Use a file written by endoprior."
         raise input_error(where, "an object with fields", type(values).__name__, fix)
-    former = [name for name in getattr(cls, "FORMER_FIELDS", ()) if _without(values, name.split(".")) != values]
-    for name in former:
-        values = _without(values, name.split("."))
-    if former:
-        print_ignored(", ".join(former))
+    if of_stored := getattr(cls, "of_stored", None):
+        values = of_stored(values)
     hints = _hints(cls)
     unknown = sorted(map(str, set(values) - set(hints)))
     if unknown:
@@ -100,22 +96,6 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     except ValueError as error:
         fix = "" if isinstance(error, InputError) else ". Fix: Correct the value."
         raise InputError(f"{where}: {error}{fix}") from error
-
-
-def _without(values: Any, path: list[str]) -> Any:
-    """A nested dict without the entry of this path."""
-    name, *inner = path
-    if not isinstance(values, dict) or name not in values:
-        return values
-    if inner:
-        return values | {name: _without(values[name], inner)}
-    return {key: value for key, value in values.items() if key != name}
-
-
-@functools.cache
-def print_ignored(names: str) -> None:
-    """Tell on stderr which fields are ignored; once per process for the same ones."""
-    print(printable(f"endoprior: stored config: ignored {names}, which this version does not have"), file=sys.stderr)
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

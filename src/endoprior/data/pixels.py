@@ -17,6 +17,8 @@ FEWEST = 8
 """... and occurs in at least so many pixels, which measured depth at such a distance does not."""
 FARTHEST = 20.0
 """Depth beyond so many times the median of an image is an error of measurement."""
+CLIP_PERCENTILES = (3.0, 99.8)
+"""Measured depths of a frame are clipped to these percentiles of themselves."""
 LEAST_PIXELS = 100
 """The median of fewer says nothing."""
 
@@ -56,7 +58,7 @@ def clean_depth(
 
     Args:
         raw: (H, W) depth, mm; missing where 0, negative or not finite.
-        cfg: percentiles, and `lift_missing_depth`, which treats missing depth as near, as EndoGaussian does.
+        cfg: `lift_missing_depth` treats missing depth as near, as EndoGaussian does.
     Returns:
         (H, W) depth, mm, 0 where missing, and (H, W) bool, True where measured. A frame without any measured depth
         is all 0 and False, lifted or not.
@@ -67,7 +69,7 @@ def clean_depth(
     measured = raw[valid]
     if measured.size == 0:
         return np.zeros_like(raw), valid
-    near, far = np.percentile(measured, (cfg.depth_clip_low_percentile, cfg.depth_clip_high_percentile))
+    near, far = np.percentile(measured, CLIP_PERCENTILES)
     missing = near if cfg.lift_missing_depth else 0
     depth = np.where(valid, np.clip(raw, np.float32(near), np.float32(far)), np.float32(missing))
     return depth, np.ones_like(valid) if cfg.lift_missing_depth else valid

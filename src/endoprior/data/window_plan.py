@@ -9,10 +9,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config import WindowConfig
 from ..core.types import Camera
 from .sequence import FrameSequence
 
+TURN_DEGREES = 15.0
+"""A window ends where the camera has turned by this since the window's first frame, degrees, ..."""
+SHIFT_SHARE = 0.1
+"""... or has moved by this share of the median depth ..."""
+PICTURE_CHANGE = 0.05
+"""... or, where the camera moves at all, the picture differs by this: mean absolute difference of color."""
+SHORTEST = 40
+"""These rules count from this frame of a window on."""
+OVERLAP = 20
+"""Frames that a window shares with the next one: in the middle half of them one fades into the other. With ten frames a
+window is worse by up to 4 dB near its end."""
 THUMBNAIL = (32, 24)
 """(width, height) of the pictures that are compared, px: noise and texture are averaged out."""
 
@@ -48,14 +58,19 @@ def look_through(sequence: FrameSequence) -> Looks:
     return Looks(thumbnails, depth_mm)
 
 
-def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> list[tuple[int, int]]:
+def plan_windows(cameras: Sequence[Camera], looks: Looks, longest: int) -> list[tuple[int, int]]:
     """First frame and the frame after the last one of every window, in order; one window if nothing asks for more.
 
-    A window goes on beyond the frame that ends it until it shares `overlap` frames with the next one.
+    A window goes on beyond the frame that ends it until it shares frames with the next one.
+
+    Args:
+        longest: most frames of a window; 0: one window. Windows that have to be short overlap less.
     """
     num = len(cameras)
-    if not cfg.enabled:
+    if not longest:
         return [(0, num)]
+    shortest = min(SHORTEST, longest)
+    overlap = min(OVERLAP, shortest // 2)
     rotations = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
     centers = np.stack([camera.center for camera in cameras])
     moving = bool(np.ptp(centers, axis=0).any() or np.ptp(rotations, axis=0).any())
@@ -66,20 +81,20 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
         depth_mm = looks.depth_mm[first] if np.isfinite(looks.depth_mm[first]) else usual_mm
         cosine = (np.trace(rotations[first] @ rotations[index].T) - 1) / 2
         return bool(
-            np.degrees(np.arccos(np.clip(cosine, -1, 1))) > cfg.turn_degrees
-            or np.linalg.norm(centers[index] - centers[first]) > cfg.shift_share * depth_mm
-            or np.abs(looks.thumbnails[index] - looks.thumbnails[first]).mean() > cfg.picture_change
+            np.degrees(np.arccos(np.clip(cosine, -1, 1))) > TURN_DEGREES
+            or np.linalg.norm(centers[index] - centers[first]) > SHIFT_SHARE * depth_mm
+            or np.abs(looks.thumbnails[index] - looks.thumbnails[first]).mean() > PICTURE_CHANGE
         )
 
     starts, first = [0], 0
     for index in range(1, num):
         length = index - first
-        if num - index < cfg.shortest:  # what is left would be too short a window
-            if num - first > cfg.longest and num - cfg.shortest >= first + cfg.overlap:
-                starts.append(num - cfg.shortest)
+        if num - index < shortest:  # what is left would be too short a window
+            if num - first > longest and num - shortest >= first + overlap:
+                starts.append(num - shortest)
             break
-        if (moving and length >= cfg.shortest and has_changed(first, index)) or length + cfg.overlap >= cfg.longest:
+        if (moving and length >= shortest and has_changed(first, index)) or length + overlap >= longest:
             first = index
             starts.append(first)
-    stops = [min(start + cfg.overlap, num) for start in starts[1:]] + [num]
+    stops = [min(start + overlap, num) for start in starts[1:]] + [num]
     return list(zip(starts, stops, strict=True))

@@ -85,13 +85,7 @@ def _compute(name: str, scorer: Scorer, context: EvaluationContext) -> None:
 
 def scored_data(trained: DataConfig) -> DataConfig:
     """How frames are read to score a scene: those it was trained on, with depth as it was measured."""
-    default = DataConfig()
-    return replace(
-        trained,
-        depth_clip_low_percentile=default.depth_clip_low_percentile,
-        depth_clip_high_percentile=default.depth_clip_high_percentile,
-        lift_missing_depth=default.lift_missing_depth,
-    )
+    return replace(trained, lift_missing_depth=False)
 
 
 def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def first_gaussians(frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
         InputError: fewer than 4 points.
     """
     init, basis = cfg.init, cfg.deformation.basis
-    cloud = initial_points(frames, init, cfg.prior, cfg.seed)
+    cloud = initial_points(frames, init, cfg.released, cfg.seed)
     cloud = cloud.subset(morton_order(cloud.points))
     num_seen = len(cloud)
     motion = initial_motion(frames, cloud, basis) if init.motion == "flow" else None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..core.checks import check_shape, input_error
-from ..core.config import InitConfig, PriorConfig
+from ..core.config import InitConfig, ReleasedMethod
 from ..core.geometry import FARTHEST_MM, back_project
 from ..core.types import Frame
 from ..priors import joint_texture_prior
+from ..priors.specular import VALUE_THRESHOLD
 from ..render.constants import NEAR_Z
 from ..system.memory import workers
 
@@ -90,12 +91,21 @@ def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> Po
     return cloud.subset(keep)
 
 
+UNIFORM_FRACTION = 0.45
+"""eta_app: share of the probability spread evenly over the eroded tissue mask."""
+EROSION_PX = 9
+"""k: side of the elliptical element that erodes the tissue mask."""
+POOL_FRACTION = 0.01
+"""Share of tissue pixels that each frame gives to EndoGaussian's pool."""
+VOXEL_DIVISIONS, OUTLIER_NEIGHBORS, OUTLIER_STD = 400, 20, 1.5
+"""Clean-up of the released code: voxels along the longest side of the box; points are dropped whose mean distance to so
+many neighbors is above the mean by more than so many standard deviations."""
 EPSILON = 1e-6
 """Keeps Eq. (6) finite where the mask or the prior is empty."""
 MIN_SQUARED_SPACING = 1e-7
 """mm^2; initial scale of points that coincide, as EndoGaussian sets it."""
 ADAPTIVE_PERCENTILE = 97.0
-"""Percentile of brightness that raises tau_v under `adaptive_specular`."""
+"""Percentile of brightness that raises tau_v (released code)."""
 PRIOR_BYTES = 200
 """Memory per pixel while sampling the points of a frame, bytes."""
 MIN_POINTS = 4
@@ -105,7 +115,7 @@ log = logging.getLogger(__name__)
 
 
 def initial_points(
-    frames: Sequence[Frame], cfg: InitConfig | None = None, prior_cfg: PriorConfig | None = None, seed: int = 0
+    frames: Sequence[Frame], cfg: InitConfig | None = None, released: ReleasedMethod | None = None, seed: int = 0
 ) -> PointCloud:
     """Sample about `cfg.budget` surface points from the training frames.
 
@@ -115,20 +125,20 @@ def initial_points(
 
     Args:
         frames: F training frames (never test frames), each used once.
-        cfg: sampler, budget, clean-up.
-        prior_cfg: parameters of the prior; its border rule is that of `cfg`.
+        cfg: sampler and budget.
+        released: what the released code does otherwise.
         seed: equal seeds give equal points.
     Returns:
         At most B points in world axes; fewer after clean-up.
     Raises:
         InputError: fewer than 4 points are left.
     """
-    cfg, prior_cfg = cfg or InitConfig(), prior_cfg or PriorConfig()
+    cfg, released = cfg or InitConfig(), released or ReleasedMethod()
     shares = [None] * len(frames) if cfg.sampler == "pool" else quotas(cfg.budget, len(frames))
 
     def sample(position: int) -> tuple[PointCloud, int]:
         rng = np.random.default_rng([seed, position])
-        return _sample_points(frames[position], position, shares[position], cfg, prior_cfg, rng)
+        return _sample_points(frames[position], position, shares[position], cfg, released, rng)
 
     threads = workers(PRIOR_BYTES * frames[0].tissue_mask.size) if len(frames) else 1
     with ThreadPoolExecutor(threads) as pool:  # NumPy and OpenCV release the interpreter lock
@@ -136,9 +146,9 @@ def initial_points(
     cloud, missing = concatenated([points for points, _ in samples]), sum(missed for _, missed in samples)
     if cfg.sampler == "pool" and len(cloud):
         cloud = cloud.subset(np.random.default_rng(seed).integers(len(cloud), size=cfg.budget))
-    if cfg.cleanup:
+    if released.cleanup:
         num_sampled = len(cloud)
-        cloud = remove_outliers(merge_voxels(cloud, cfg.voxel_divisions), cfg.outlier_neighbors, cfg.outlier_std)
+        cloud = remove_outliers(merge_voxels(cloud, VOXEL_DIVISIONS), OUTLIER_NEIGHBORS, OUTLIER_STD)
         log.info("initialization: %d of %d points left after clean-up", len(cloud), num_sampled)
     if len(cloud) < MIN_POINTS:
         want = f"at least {MIN_POINTS} tissue pixels with depth between {NEAR_Z:g} and {FARTHEST_MM:g} mm"
@@ -155,35 +165,41 @@ def has_surface(frame: Frame) -> NDArray[np.bool_]:
 
 
 def _sample_points(
-    frame: Frame, position: int, count: int | None, cfg: InitConfig, prior_cfg: PriorConfig, rng: np.random.Generator
+    frame: Frame,
+    position: int,
+    count: int | None,
+    cfg: InitConfig,
+    released: ReleasedMethod,
+    rng: np.random.Generator,
 ) -> tuple[PointCloud, int]:
     """`count` points of one frame (None: the share of its pixels that is pooled), and the number of missing points."""
-    probability = pixel_probability(frame, cfg, prior_cfg)
+    probability = pixel_probability(frame, cfg, released.prior)
     available = int(np.count_nonzero(probability))
     if count is None:
-        count = min(available, max(1, int(cfg.pool_fraction * available)))
-    return _back_project(frame, position, sample_pixels(probability, count, rng), cfg), max(0, count - available)
+        count = min(available, max(1, int(POOL_FRACTION * available)))
+    cloud = _back_project(frame, position, sample_pixels(probability, count, rng), released.half_pixel_shift)
+    return cloud, max(0, count - available)
 
 
-def pixel_probability(frame: Frame, cfg: InitConfig, prior_cfg: PriorConfig) -> NDArray[np.float64]:
+def pixel_probability(frame: Frame, cfg: InitConfig, released_prior: bool = False) -> NDArray[np.float64]:
     """(H, W) sampling weight >= 0 of each pixel for the sampler of `cfg`; 0 outside tissue or `has_surface`.
 
     For `uniform` and `pool` all tissue pixels have the same weight, including the rim that Eq. (6) erodes.
+    `released_prior`: tau_v rises with the brightness, and the percentile of Eq. (5) is that of the eroded mask.
     """
     if cfg.sampler != "prior":
         return (frame.tissue_mask & has_surface(frame)).astype(np.float64)
-    eroded = eroded_mask(frame.tissue_mask, cfg.erosion_px)
-    if cfg.adaptive_specular and eroded.any():
-        bright = float(np.percentile(frame.rgb.max(-1)[eroded], ADAPTIVE_PERCENTILE))
-        threshold = max(prior_cfg.specular.value_threshold, bright)
-        prior_cfg = replace(prior_cfg, specular=replace(prior_cfg.specular, value_threshold=threshold))
-    prior_cfg = replace(prior_cfg, salience=replace(prior_cfg.salience, border=cfg.salience_border))
-    rho = joint_texture_prior(frame.rgb, eroded if cfg.salience_on_eroded_mask else frame.tissue_mask, prior_cfg)
-    return np.where(has_surface(frame), sampling_distribution(rho, frame.tissue_mask, cfg), 0.0)
+    tissue, threshold = frame.tissue_mask, VALUE_THRESHOLD
+    if released_prior:
+        tissue = eroded_mask(tissue)
+        if tissue.any():
+            threshold = max(threshold, float(np.percentile(frame.rgb.max(-1)[tissue], ADAPTIVE_PERCENTILE)))
+    rho = joint_texture_prior(frame.rgb, tissue, value_threshold=threshold)
+    return np.where(has_surface(frame), sampling_distribution(rho, frame.tissue_mask), 0.0)
 
 
 def sampling_distribution(
-    rho: NDArray[np.floating], tissue_mask: NDArray[np.bool_], cfg: InitConfig | None = None
+    rho: NDArray[np.floating], tissue_mask: NDArray[np.bool_], uniform: float = UNIFORM_FRACTION
 ) -> NDArray[np.float64]:
     """Sampling probability of each pixel: P, paper Eq. (6).
 
@@ -193,31 +209,31 @@ def sampling_distribution(
     Args:
         rho: (H, W) joint texture prior in [0, 1].
         tissue_mask: (H, W) True on tissue.
-        cfg: eta_app and the size of the erosion.
+        uniform: eta_app, share of the probability spread evenly over the eroded mask.
     Returns:
         (H, W) probabilities that sum to 1; all 0 without tissue.
     Raises:
         ValueError: shapes differ, or rho is negative or not finite.
     """
-    cfg = cfg or InitConfig()
     check_shape("rho:H,W tissue_mask:H,W", rho=rho, tissue_mask=tissue_mask)
     if rho.size and not (rho.min() >= 0 and np.isfinite(rho.max())):
         raise ValueError(f"rho must be finite and >= 0, got values from {rho.min()} to {rho.max()}")
-    inside = eroded_mask(tissue_mask, cfg.erosion_px).astype(np.float64)
+    inside = eroded_mask(tissue_mask).astype(np.float64)
     structured = rho * inside
-    probability = cfg.uniform_fraction * inside / (inside.sum() + EPSILON)
-    probability += (1 - cfg.uniform_fraction) * structured / (structured.sum() + EPSILON)
+    probability = uniform * inside / (inside.sum() + EPSILON)
+    probability += (1 - uniform) * structured / (structured.sum() + EPSILON)
     total = probability.sum()
     if total == 0:  # no texture and no uniform share: uniform; no tissue: 0
         probability, total = inside, inside.sum()
     return probability / total if total > 0 else probability
 
 
-def eroded_mask(tissue_mask: NDArray[np.bool_], size_px: int) -> NDArray[np.bool_]:
-    """The mask M eroded by an ellipse B_k of `size_px` x `size_px` px.
+def eroded_mask(tissue_mask: NDArray[np.bool_], size_px: int | None = None) -> NDArray[np.bool_]:
+    """The mask M eroded by an ellipse B_k of `size_px` x `size_px` px; None: `EROSION_PX`.
 
     Pixels outside the image do not erode. Returns the mask itself if nothing would be left.
     """
+    size_px = EROSION_PX if size_px is None else size_px
     if size_px <= 1:
         return tissue_mask
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size_px, size_px))
@@ -266,11 +282,10 @@ def initial_log_scales(points: NDArray[np.floating], variance_factor: float = 1.
     return (0.5 * np.log(variance_factor * spacing)).astype(np.float32)
 
 
-def _back_project(frame: Frame, position: int, flat: NDArray[np.intp], cfg: InitConfig) -> PointCloud:
-    """World points and colors of pixels, given by flat index, of the frame at `position`."""
+def _back_project(frame: Frame, position: int, flat: NDArray[np.intp], shifted: bool) -> PointCloud:
+    """World points and colors of pixels, given by flat index, of the frame at `position`; `shifted` by half a pixel."""
     v, u = np.divmod(flat, frame.camera.width)
-    offset = 0.5 if cfg.pixel_offset == "exact" else 0.0
-    pixels = np.stack([u, v], -1) + offset
+    pixels = np.stack([u, v], -1) + (0.0 if shifted else 0.5)
     points = back_project(pixels, frame.depth[v, u].astype(np.float64), frame.camera)
     colors = frame.rgb_u8[v, u].astype(np.float32) / np.float32(255)
     return PointCloud(points.astype(np.float32), colors, np.full(len(points), position, np.int32))

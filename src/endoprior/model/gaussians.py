@@ -1,14 +1,14 @@
 """The canonical Gaussians: the table of their trained tensors, activations, and what offsets make of them.
 
 `N` Gaussians; every tensor's first axis is the Gaussian. Raw values are unconstrained: `exp` turns `log_scales` into
-mm, the logistic function turns `opacity_logits` into opacities. Shapes, learning rates and temporal offsets all follow
-`ATTRIBUTES`: to give Gaussians a new attribute, add a row there, its starting value to `create_gaussians` and its use
-to `Gaussians.splats`. Files, checkpoints, the optimizer and density control need no change.
+mm, the logistic function turns `opacity_logits` into opacities. Shapes and temporal offsets follow `ATTRIBUTES`: to
+give Gaussians a new attribute, add a row there, its learning rate to `training.optimizer.RATES`, its starting value to
+`create_gaussians` and its use to `Gaussians.splats`. Files, checkpoints and density control need no change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -34,22 +34,18 @@ class Attribute:
     name: str
     width: int
     """Numbers per Gaussian that a deformation may add an offset to: 3 for colors, whatever their degree."""
-    rate: str
-    """Field of `OptimConfig`: learning rate. Where `<rate>_final` exists too, the rate decays to it."""
-    basis_rate: str = ""
-    """Field of `OptimConfig`: learning rate of its temporal coefficients. Empty: it never changes with time."""
-    switch: str = ""
-    """Field of `DeformationConfig` that lets it change with time. Empty: it always does, if it ever does."""
+    changes: Callable[[DeformationConfig], bool] = lambda cfg: False
+    """Whether it changes with time."""
 
 
 ATTRIBUTES = (
-    Attribute("means", 3, "means_lr", "basis_means_lr"),
-    Attribute("quats", 4, "quats_lr", "basis_quats_lr", "deform_quats"),
-    Attribute("log_scales", 3, "scales_lr", "basis_log_scales_lr", "deform_scales"),
-    Attribute("opacity_logits", 1, "opacity_lr", "basis_opacity_lr", "deform_opacity"),
-    Attribute("sh_dc", 3, "sh_dc_lr", "basis_color_lr"),
-    Attribute("sh_rest", 3, "sh_rest_lr"),
-    Attribute("color_slopes", 3, "color_slopes_lr"),
+    Attribute("means", 3, lambda cfg: True),
+    Attribute("quats", 4, lambda cfg: cfg.deform_shape),
+    Attribute("log_scales", 3, lambda cfg: cfg.deform_shape),
+    Attribute("opacity_logits", 1, lambda cfg: cfg.deform_opacity),
+    Attribute("sh_dc", 3, lambda cfg: cfg.kind == "basis"),
+    Attribute("sh_rest", 3),
+    Attribute("color_slopes", 3),
 )
 """Every attribute but `motion`, the temporal coefficients of the others. The channels of `motion` and the heads of a
 HexPlane field follow this order."""
@@ -57,9 +53,7 @@ HexPlane field follow this order."""
 
 def offset_widths(cfg: DeformationConfig) -> dict[str, int]:
     """Attributes that change with time under `cfg`, in order, with the numbers that an offset of each has."""
-    changing = [a for a in ATTRIBUTES if a.basis_rate and (not a.switch or getattr(cfg, a.switch))]
-    with_color = cfg.kind == "basis" and cfg.basis.deform_color
-    return {a.name: a.width for a in changing if a.name != "sh_dc" or with_color}
+    return {a.name: a.width for a in ATTRIBUTES if a.changes(cfg)}
 
 
 def motion_layout(cfg: DeformationConfig) -> dict[str, slice]:

@@ -86,7 +86,6 @@ class PlaneGrid:
         space = np.array([[r * m for r in cfg.resolution] for m in cfg.multires], dtype=np.int64).reshape(-1, 3)
         self.resolution = space
         self.time_resolution = cfg.time_resolution
-        self.time_map = cfg.time_map
         self.channels = cfg.channels
         self._shapes = [[shapes[name] for name in PLANE_NAMES] for shapes in plane_shapes(cfg)]
         sizes = np.array([[rows * columns for rows, columns in scale] for scale in self._shapes], dtype=np.int64)
@@ -178,10 +177,10 @@ class PlaneGrid:
     def time_row(self, time: float) -> tuple[int, np.float32]:
         """Row r and fraction f of the time planes at `time`: the sample is (1 - f) * row r + f * row r + 1.
 
-        `raw` takes t itself as the coordinate in [-1, 1], `full` takes 2 t - 1; both are clamped to the planes.
+        As published, t in [0, 1] itself is the coordinate in [-1, 1], so that half of the planes is used.
         """
         last = self.time_resolution - 1
-        position = (time if self.time_map == "full" else (time + 1) / 2) * last
+        position = (time + 1) / 2 * last
         position = min(max(position, 0.0), float(last))
         row = min(int(position), last - 1)
         return row, np.float32(position - row)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from copy import copy
-from typing import Literal, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -29,38 +29,53 @@ from .ops import ModelOps
 class HexPlaneField(Field):
     """The paper's deformation field: box, planes, trunk and heads."""
 
+    width: ClassVar[int] = 32
+    """Hidden width of trunk and heads."""
+    learns_box: ClassVar[bool] = True
+    """The box is trained together with the planes, as EndoGaussian does without saying so."""
     grid: PlaneGrid
 
-    def __init__(self, box: Tensor, cfg: DeformationConfig, generator: torch.Generator, *, draw: bool = True) -> None:
+    def __init__(
+        self,
+        box: Tensor,
+        cfg: DeformationConfig,
+        generator: torch.Generator,
+        *,
+        draw: bool = True,
+        zero_biases: bool = False,
+    ) -> None:
         """Start a field.
 
         Args:
             box: (2, 3) corners, mm, in the order [max, min]; `box_of_points` makes one.
             generator: source of all random numbers: space planes first, then trunk and heads.
             draw: False leaves the planes at 1.
+            zero_biases: biases of trunk and heads start at 0 (released code).
         """
         check_shape("box:2,3", box=box)
         self.cfg = cfg
         self.grid = PlaneGrid(cfg.hexplane)
         if draw:
             self.grid.initialize(generator)
-        self.box = box.detach().to(torch.float32).clone().requires_grad_(cfg.hexplane.learn_box)
-        self.heads = self.make_heads(cfg, generator)
+        self.box = box.detach().to(torch.float32).clone().requires_grad_(self.learns_box)
+        self.heads = self.make_heads(cfg, generator, zero_biases)
 
     @classmethod
-    def make_heads(cls, cfg: DeformationConfig, generator: torch.Generator) -> LinearLayers:
+    def make_heads(cls, cfg: DeformationConfig, generator: torch.Generator, zero_biases: bool) -> LinearLayers:
         """Trunk and heads with fresh weights."""
-        return OffsetHeads(cls.layer_shapes(cfg), cfg.hexplane.bias_init, generator)
+        return OffsetHeads(cls.layer_shapes(cfg), generator, zero_biases)
 
     @classmethod
     def layer_shapes(cls, cfg: DeformationConfig) -> dict[str, tuple[int, int]]:
         """Outputs and inputs of each layer of trunk and heads."""
-        return head_shapes(num_features(cfg), cfg.hexplane.width, offset_widths(cfg))
+        return head_shapes(num_features(cfg), cls.width, offset_widths(cfg))
 
     @classmethod
-    def from_points(cls, points: Tensor, cfg: DeformationConfig, generator: torch.Generator) -> Self:
+    def from_points(
+        cls, points: Tensor, cfg: DeformationConfig, generator: torch.Generator, zero_biases: bool = False
+    ) -> Self:
         """A field whose box holds the initial points (N, 3), mm."""
-        return cls(box_of_points(points), cfg, generator)
+        return cls(box_of_points(points), cfg, generator, zero_biases=zero_biases)
 
     @classmethod
     def from_state_arrays(cls, arrays: Mapping[str, Tensor], cfg: DeformationConfig) -> Self:
@@ -137,7 +152,7 @@ class HexPlaneField(Field):
         shapes = cls.state_shapes(cfg)
         heads = [shape for name, shape in shapes.items() if name.startswith("heads.")]
         named = {f"network.{i}": shape for i, shape in enumerate(heads)}
-        return named | ({"box": shapes["hexplane.box"]} if cfg.hexplane.learn_box else {})
+        return named | ({"box": shapes["hexplane.box"]} if cls.learns_box else {})
 
     def state_arrays(self) -> dict[str, Tensor]:
         """Every number that defines the field, by name; views of live memory, not copies."""
@@ -170,7 +185,8 @@ class HexPlaneMotion(Motion):
 
     def field(self, points: Tensor, cfg: Config) -> HexPlaneField:
         """See `Motion.field`."""
-        return self.field_class.from_points(points, cfg.deformation, torch.Generator().manual_seed(cfg.seed))
+        generator = torch.Generator().manual_seed(cfg.seed)
+        return self.field_class.from_points(points, cfg.deformation, generator, cfg.released.zero_biases)
 
     def field_of(self, arrays: Mapping[str, Tensor], cfg: Config) -> HexPlaneField:
         """See `Motion.field_of`."""
@@ -206,19 +222,19 @@ class LinearLayers:
     """Linear layers by name; `parameters` names every trained tensor. The layer `trunk` reads a field's features."""
 
     def __init__(
-        self, shapes: dict[str, tuple[int, int]], bias_init: Literal["default", "zero"], generator: torch.Generator
+        self, shapes: dict[str, tuple[int, int]], generator: torch.Generator, zero_biases: bool = False
     ) -> None:
         """Draw the weights from `generator`.
 
         Args:
             shapes: outputs and inputs of each layer by name.
-            bias_init: `default` draws biases from U[-1, 1] / sqrt(inputs) as PyTorch does; `zero` sets them to 0.
+            zero_biases: biases are 0; else drawn from U[-1, 1] / sqrt(inputs) as PyTorch does.
         """
         self.parameters: dict[str, Tensor] = {}
         for layer, (fan_out, fan_in) in shapes.items():
             weight, bias = torch.empty(fan_out, fan_in), torch.zeros(fan_out)
             xavier_uniform_(weight, generator=generator)
-            if bias_init == "default":
+            if not zero_biases:
                 bias.uniform_(-1 / math.sqrt(fan_in), 1 / math.sqrt(fan_in), generator=generator)
             self.parameters[f"{layer}.weight"] = weight.requires_grad_(True)
             self.parameters[f"{layer}.bias"] = bias.requires_grad_(True)

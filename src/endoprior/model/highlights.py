@@ -59,8 +59,8 @@ def without_highlights(scene: Scene, frames_of: FramesOf) -> Scene:
     if not changes_color(scene):
         kind = scene.config.deformation.kind
         raise InputError(
-            f"highlights: expected a scene whose colors change with time; got deformation.kind {kind} without "
-            "basis.deform_color. Train it with --preset default."
+            f"highlights: expected a scene whose colors change with time; got deformation.kind {kind}. "
+            "Train it with --preset default."
         )
     return scene.changed(lambda part, window: _refitted_scene(part, frames_of(window)))
 

@@ -6,7 +6,7 @@ parameters: centers (mm), log scales, quaternions before normalization, opacity 
 
 Temporal basis: offset_i(t) = sum_b w_b(t) motion_i,b with w_b(t) = max(0, (exp(-d^2 / 2) - e) / (1 - e)),
 d = (t - c_b) / s and e = exp(-3^2 / 2): a Gaussian, lowered by 0.011 so that its support ends at three standard
-deviations without a jump. Centers c_b lie evenly on [0, 1], s = relative_width / B. Zero coefficients are the identity.
+deviations without a jump. Centers c_b lie evenly on [0, 1], s = 1.5 / B. Zero coefficients are the identity.
 Yang et al., "Deform3DGS", MICCAI 2024, use a basis of this kind per Gaussian.
 """
 
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from .hexplane import PlaneGrid
     from .ops import ModelOps
 
+RELATIVE_WIDTH = 1.5
+"""Standard deviation of a basis function in units of 1 / B."""
 SUPPORT = 3.0
 """Half of the support of a basis function, in standard deviations."""
 
@@ -187,7 +189,7 @@ class BasisMotion(Motion):
 def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
     """(B,) values w_b(t) of the basis functions, in [0, 1]."""
     distance = time - np.linspace(0, 1, cfg.num_bases)
-    sigma = cfg.relative_width / cfg.num_bases
+    sigma = RELATIVE_WIDTH / cfg.num_bases
     end = np.exp(-0.5 * SUPPORT**2)
     return np.maximum(0.0, (np.exp(-0.5 * (distance / sigma) ** 2) - end) / (1 - end))
 

@@ -9,8 +9,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from ..core.checks import InputError
-from ..core.config import Config, DataConfig, DensityConfig, InitConfig, OptimConfig, SalienceConfig, TemporalConfig
-from ..core.config_deformation import DeformationConfig, HexPlaneConfig
+from ..core.config import Config, ReleasedMethod
 from ..system.plugins import Registry
 
 
@@ -28,98 +27,77 @@ def preset(name: str = "default", **changes: Any) -> Config:
     return made.replace(changes) if changes else made
 
 
-def paper() -> Config:
-    """The paper's equations and constants, literally; EndoGaussian's choices where the paper is silent."""
-    return Config()
-
-
-def released() -> Config:
-    """What the authors' released code does where it differs from the paper."""
-    return Config(
-        data=DataConfig(lift_missing_depth=True),
-        init=InitConfig(
-            adaptive_specular=True,
-            salience_on_eroded_mask=True,
-            cleanup=True,
-            pixel_offset="legacy",
-            variance_factor=0.4,
-        ),
-        deformation=DeformationConfig(deform_opacity=True, hexplane=HexPlaneConfig(bias_init="zero")),
-        density=DensityConfig(prune_max_scale_mm=40.0, score_mode="events", unobserved_score=1.0),
-        temporal=TemporalConfig(
-            huber_scale="released",
-            adaptive_motion_weight=True,
-            min_valid=1,
-            valid_at_both=False,
-            max_points=1024,
-            refill=True,
-            gradient="current",
-        ),
-        prior=replace(Config().prior, salience=SalienceConfig(border="zero")),
-        optim=OptimConfig(decay_iterations=3000),
-    )
-
-
-def endogaussian() -> Config:
-    """The baseline, conference version: no prior anywhere, pool sampling, plain 3DGS density control."""
-    return Config(
-        data=DataConfig(lift_missing_depth=True),
-        init=InitConfig(sampler="pool", pixel_offset="legacy"),
-        density=DensityConfig(min_densify_weight=1.0, prior_prune=False),
-        temporal=TemporalConfig(weight=0.0),
-    )
-
-
 def default() -> Config:
     """What we recommend: the paper's prior, and motion as temporal coefficients of each Gaussian, seeded by flow.
 
     Its rates suit 1,500 iterations: those of 3DGS are meant for twenty times as many.
     """
+    return Config()
+
+
+def paper() -> Config:
+    """The paper's equations and constants, literally; EndoGaussian's choices where the paper is silent."""
     base = Config()
     return replace(
         base,
         init=replace(
-            base.init, budget=30_000, motion="flow", thickness=0.3, opacity=0.3, fill_unseen=True, variance_factor=0.4
+            base.init,
+            budget=20_000,
+            variance_factor=1.0,
+            thickness=1.0,
+            opacity=0.1,
+            fill_unseen=False,
+            motion="rest",
         ),
-        deformation=replace(
-            base.deformation,
-            kind="basis",
-            basis=replace(base.deformation.basis, num_bases=0),
-            max_scale_change=2.0,
-        ),
-        render=replace(base.render, depth_grad_to_means=True, color_slopes=True),
+        deformation=replace(base.deformation, kind="hexplane", max_scale_change=0.0),
+        render=replace(base.render, depth_grad_to_means=False, color_slopes=False),
         loss=replace(
             base.loss,
-            depth_weight=6.0,
-            edge_weight=0.5,
-            track_weight=0.02,
-            tv_weight=0.003,
-            tv_on_tissue=False,
-            cover_weight=0.01,
-            trust_masks=False,
+            depth_weight=1.0,
+            edge_weight=0.0,
+            tv_weight=0.03,
+            cover_weight=0.0,
+            track_weight=0.0,
+            trust_masks=True,
         ),
-        temporal=replace(
-            base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False, gradient="current"
-        ),
-        density=replace(base.density, grow_threshold=3e-4, max_scale_share=0.025),
+        temporal=replace(base.temporal, start_iteration=1000, min_valid=20, gradient="both"),
+        density=replace(base.density, grow_threshold=2e-4),
         optim=replace(
-            base.optim,
-            means_lr=5e-3,
-            means_lr_final=5e-5,
-            scales_lr=2e-2,
-            quats_lr=1e-2,
-            basis_means_lr=1e-2,
-            basis_quats_lr=1e-2,
-            basis_log_scales_lr=1e-2,
-            basis_color_lr=1e-2,
-            basis_epsilon=1e-7,
-            late_decay=0.1,
-            decay_iterations=1500,
+            base.optim, means_lr=1.6e-4, scales_lr=5e-3, quats_lr=1e-3, decay_iterations=4000, late_decay=1.0
         ),
         schedule=replace(
-            base.schedule, coarse_iterations=0, fine_iterations=1500, half_resolution_iterations=500, sh_degree=0
+            base.schedule, coarse_iterations=1000, fine_iterations=3000, half_resolution_iterations=0, sh_degree=3
         ),
-        windows=replace(base.windows, enabled=True),
+        windows=replace(base.windows, longest=0),
+    )
+
+
+def released() -> Config:
+    """What the authors' released code does where it differs from the paper."""
+    base = paper()
+    return replace(
+        base,
+        data=replace(base.data, lift_missing_depth=True),
+        init=replace(base.init, variance_factor=0.4),
+        deformation=replace(base.deformation, deform_opacity=True),
+        temporal=replace(base.temporal, min_valid=1, gradient="current"),
+        optim=replace(base.optim, decay_iterations=3000),
+        released=ReleasedMethod(
+            prior=True, cleanup=True, half_pixel_shift=True, zero_biases=True, prune_max_scale_mm=40.0
+        ),
+    )
+
+
+def endogaussian() -> Config:
+    """The baseline, conference version: no prior anywhere, pool sampling, plain 3DGS density control."""
+    base = paper()
+    return replace(
+        base,
+        data=replace(base.data, lift_missing_depth=True),
+        init=replace(base.init, sampler="pool"),
+        density=replace(base.density, min_densify_weight=1.0),
+        temporal=replace(base.temporal, weight=0.0),
+        released=ReleasedMethod(half_pixel_shift=True),
     )
 
 

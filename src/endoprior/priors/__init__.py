@@ -4,7 +4,7 @@ NumPy only; every function works on one image.
 """
 
 from .joint import joint_texture_prior
-from .salience import edge_magnitude, salience
+from .salience import Border, edge_magnitude, salience
 from .specular import specular_likelihood
 
-__all__ = ["edge_magnitude", "joint_texture_prior", "salience", "specular_likelihood"]
+__all__ = ["Border", "edge_magnitude", "joint_texture_prior", "salience", "specular_likelihood"]

@@ -6,31 +6,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape
-from ..core.config import PriorConfig
-from .salience import salience
+from .salience import Border, salience
 from .specular import specular_likelihood
 
 
 def joint_texture_prior(
-    rgb: NDArray[np.floating], tissue_mask: NDArray[np.bool_], cfg: PriorConfig | None = None
+    rgb: NDArray[np.floating],
+    tissue_mask: NDArray[np.bool_],
+    *,
+    value_threshold: float | None = None,
+    border: Border = "reflect",
 ) -> NDArray[np.float32]:
     """Reliability of each pixel as the position of a Gaussian: rho = M (1 - L^sp) E, paper Eq. (1).
 
     Args:
         rgb: (H, W, 3) floating-point color in [0, 1].
         tissue_mask: (H, W) bool, True on usable tissue (M).
-        cfg: parameters of the two cues; the paper's by default.
+        value_threshold: brightness above which a pale pixel is a highlight; None: the paper's.
+        border: see `salience`.
     Returns:
         (H, W) prior in [0, 1]; 0 off the tissue, and everywhere when the mask is empty.
     Raises:
         ValueError: a shape or type differs, or a color is not finite or outside [0, 1].
     """
-    cfg = cfg or PriorConfig()
     rgb, tissue_mask = np.asarray(rgb), np.asarray(tissue_mask)
     check_shape("rgb:H,W,3 tissue_mask:H,W", rgb=rgb, tissue_mask=tissue_mask)
     _check_values(rgb, tissue_mask)
-    keep = np.float32(1) - specular_likelihood(rgb, cfg.specular)
-    return np.where(tissue_mask, keep * salience(rgb, tissue_mask, cfg.salience), np.float32(0))
+    keep = np.float32(1) - specular_likelihood(rgb, value_threshold)
+    return np.where(tissue_mask, keep * salience(rgb, tissue_mask, border), np.float32(0))
 
 
 def _check_values(rgb: NDArray, tissue_mask: NDArray) -> None:

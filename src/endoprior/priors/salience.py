@@ -7,8 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config import SalienceConfig
-
+Border = Literal["reflect", "zero"]
+"""How the Sobel filter continues the image: `zero` makes bright borders edges (released code)."""
+PERCENTILE = 99.0
+"""p: the edge magnitude at this percentile of tissue pixels maps to 1."""
 EPSILON = 1e-6
 """Keeps the salience of a constant image finite; in units of gray (0..1) times the kernel's weight."""
 LUMA = (0.299, 0.587, 0.114)
@@ -16,7 +18,7 @@ LUMA = (0.299, 0.587, 0.114)
 
 
 def salience(
-    rgb: NDArray[np.floating], tissue_mask: NDArray[np.bool_], cfg: SalienceConfig | None = None
+    rgb: NDArray[np.floating], tissue_mask: NDArray[np.bool_], border: Border = "reflect"
 ) -> NDArray[np.float32]:
     """Strength of edges and texture, relative to a high percentile on tissue. E, paper Eqs. (3)-(5).
 
@@ -25,21 +27,19 @@ def salience(
     Args:
         rgb: (H, W, 3) color in [0, 1].
         tissue_mask: (H, W) True where the percentile is taken; the result is not masked.
-        cfg: percentile and border rule; the paper's by default.
     Returns:
         (H, W) salience in [0, 1]; all 0 when the mask is empty.
     """
-    cfg = cfg or SalienceConfig()
     red, green, blue = (np.float32(w) * rgb[..., c].astype(np.float32) for c, w in enumerate(LUMA))
-    magnitude = edge_magnitude(red + green + blue, cfg.border)
+    magnitude = edge_magnitude(red + green + blue, border)
     on_tissue = magnitude[tissue_mask]
     if on_tissue.size == 0:
         return np.zeros_like(magnitude)
-    strong = np.float32(np.percentile(on_tissue, cfg.percentile) + EPSILON)
+    strong = np.float32(np.percentile(on_tissue, PERCENTILE) + EPSILON)
     return np.minimum(magnitude / strong, np.float32(1))
 
 
-def edge_magnitude(gray: NDArray[np.floating], border: Literal["reflect", "zero"] = "reflect") -> NDArray[np.float32]:
+def edge_magnitude(gray: NDArray[np.floating], border: Border = "reflect") -> NDArray[np.float32]:
     """Length of the Sobel gradient, sqrt(Gx^2 + Gy^2), with the 3 x 3 kernels of paper Eq. (4).
 
     Args:

@@ -75,7 +75,7 @@ def _key(cfg: Config) -> str:
         name, facts = file.relative_to(PACKAGE).as_posix(), file.stat()
         digest.update(f"{name} {facts.st_size} {facts.st_mtime_ns}".encode())
     digest.update(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version}".encode())
-    temporal = (cfg.temporal.weight > 0, cfg.temporal.valid_at_both, cfg.temporal.gradient)
+    temporal = (cfg.temporal.weight > 0, cfg.temporal.gradient)
     parts = (cfg.method, cfg.deformation, cfg.render, cfg.schedule.sh_degree, cfg.init.motion, *temporal)
     digest.update(json.dumps([to_dict(part) for part in parts]).encode())
     return digest.hexdigest()[:16]
@@ -102,7 +102,8 @@ def shortened(cfg: Config) -> Config:
     return replace(
         cfg,
         data=replace(cfg.data, eyes="left"),
-        init=replace(cfg.init, budget=400, cleanup=False, erosion_px=3),
+        init=replace(cfg.init, budget=400),
+        released=replace(cfg.released, cleanup=False),
         schedule=replace(cfg.schedule, coarse_iterations=2, fine_iterations=8, half_resolution_iterations=1),
         density=replace(cfg.density, start_iteration=0, every=3, grow_threshold=1e-7),
         temporal=replace(cfg.temporal, start_iteration=2, min_points=8, min_valid=0),

@@ -11,7 +11,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..core.config import PriorConfig
 from ..core.geometry import length_unit
 from ..data import FrameSequence
 from ..evaluation.registry import all_scores
@@ -79,7 +78,7 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
         tissue = sequence.truth.tissue(frame.index) if sequence.truth else None
         if tissue is not None:
             cells.append(("true tissue", tissue))
-        rho = joint_texture_prior(frame.rgb, frame.tissue_mask, PriorConfig())
+        rho = joint_texture_prior(frame.rgb, frame.tissue_mask)
         cells += [
             (f"error on tissue, 0..{ERROR_FULL_SCALE}", colorize(error, 0, ERROR_FULL_SCALE, frame.tissue_mask)),
             (f"depth, {span[0]:.0f}..{span[1]:.0f} {unit}", colorize(depth, *span, depth > 0)),

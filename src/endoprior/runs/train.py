@@ -116,13 +116,13 @@ def start_run(
         if wanted != found and field.name not in ("format", "eyes"):
             got = f"a sequence that was read with {found!r}"
             raise input_error(f"data.{field.name}", repr(wanted), got, "`load_sequence(DATA, config.data)`.")
-    if cfg.windows.enabled:
+    if cfg.windows.longest:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
-        plan = plan_windows(cameras, look_through(whole), cfg.windows)
+        plan = plan_windows(cameras, look_through(whole), cfg.windows.longest)
         if len(plan) > 1 and not method_of(cfg).has_gaussians:
-            want, got = f"False with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
-            raise input_error("windows.enabled", want, got, "Add --windows.no-enabled.")
+            want, got = f"0 with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
+            raise input_error("windows.longest", want, got, "Add --windows.longest 0.")
         if len(plan) > 1:
             return WindowedRun(sequence, cfg, plan, out, resume=resume, say=say)
     return TrainingRun(sequence, cfg, out, resume=resume, say=say)
@@ -208,7 +208,7 @@ def window_config(cfg: Config, start: int, stop: int) -> Config:
     """The config of the run of one window: an ordinary training on these frames of what `cfg` reads."""
     first = min(read_ranges("data.window", cfg.data.window), default=0)
     data = replace(cfg.data, window=f"{first + start}-{first + stop - 1}")
-    return replace(cfg, data=data, windows=replace(cfg.windows, enabled=False))
+    return replace(cfg, data=data, windows=replace(cfg.windows, longest=0))
 
 
 class WindowedRun:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..compute.morton import morton_order
-from ..core.config import DensityConfig
+from ..core.config import DensityConfig, ReleasedMethod
 from ..core.geometry import quaternion_to_matrix
 from ..model.gaussians import SH_C0, Gaussians
 from .density_stats import DensityStats
@@ -24,6 +24,11 @@ from .divergence import ADVICE, Diverged
 
 if TYPE_CHECKING:
     from .optimizer import Optimizer
+
+MAX_GAUSSIANS = 200_000  # growth stops at this count: a guard of memory, not part of the method
+CLONE_EXTENT = 0.01  # Gaussians with a scale up to this share of the scene extent are cloned, larger ones split
+SPLIT_SHRINK = 1.6  # children of a split have the parent's scale divided by this
+PRIOR_OPACITY = 0.0075  # tau_alpha: Gaussians of low prior are removed below this mean opacity
 
 
 @dataclass(frozen=True)
@@ -54,50 +59,56 @@ def densify_weight(score: Tensor, cfg: DensityConfig) -> Tensor:
     return floor + (1 - floor) * score
 
 
-def plan(stats: DensityStats, scales: Tensor, opacities: Tensor, extent: float, cfg: DensityConfig) -> Plan:
+def plan(
+    stats: DensityStats,
+    scales: Tensor,
+    opacities: Tensor,
+    extent: float,
+    cfg: DensityConfig,
+    released: ReleasedMethod | None = None,
+    clone_extent: float = CLONE_EXTENT,
+) -> Plan:
     """Choose what to clone, split and remove: Eq. (8), the prior prune, and 3DGS's rules. Pure.
 
     Args:
         scales: (N, 3) canonical, mm. opacities: (N,) canonical. extent: scene extent, mm.
+        clone_extent: share of the extent up to which a Gaussian is cloned, not split.
     """
-    score = stats.score(cfg.unobserved_score)
+    released = released or ReleasedMethod()
+    largest_mm, by_prior = released.prune_max_scale_mm, cfg.min_densify_weight < 1
+    score = stats.score(released.unobserved_score)
     gradient = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1)
     largest = scales.amax(-1)
     faint = opacities < cfg.prune_opacity
-    huge = largest > cfg.prune_max_scale_mm if cfg.prune_max_scale_mm > 0 else torch.zeros_like(faint)
+    huge = largest > largest_mm if largest_mm > 0 else torch.zeros_like(faint)
     distrusted = torch.zeros_like(faint)
-    if cfg.prior_prune:
+    if by_prior:
         distrusted = (
             (stats.num_valid >= cfg.min_valid)
             & (score < cfg.prior_threshold)
-            & (stats.mean_opacity(opacities) < cfg.prior_opacity)
+            & (stats.mean_opacity(opacities) < PRIOR_OPACITY)
         )
     grow = (densify_weight(score, cfg) * gradient >= cfg.grow_threshold) & ~faint
-    small = largest <= cfg.clone_extent * extent
+    small = largest <= clone_extent * extent
     # Pruning follows growth: children are smaller and unobserved, so only their size can condemn them.
-    children_huge = huge & (largest / cfg.split_shrink > cfg.prune_max_scale_mm)
+    children_huge = huge & (largest / SPLIT_SHRINK > largest_mm)
     split = grow & ~small & ~children_huge
     clone = grow & small & ~huge & ~distrusted
     remove = (faint | huge | distrusted) & ~split
-    if len(scales) + int(clone.sum()) + int(split.sum()) - int(remove.sum()) > cfg.max_gaussians:
+    if len(scales) + int(clone.sum()) + int(split.sum()) - int(remove.sum()) > MAX_GAUSSIANS:
         clone, split = torch.zeros_like(clone), torch.zeros_like(split)
         remove = faint | huge | distrusted
-    rules = {"opacity": faint} | ({"size": huge} if cfg.prune_max_scale_mm else {})
-    rules |= {"prior": distrusted} if cfg.prior_prune else {}
+    rules = {"opacity": faint} | ({"size": huge} if largest_mm else {})
+    rules |= {"prior": distrusted} if by_prior else {}
     return Plan(clone=clone, split=split, remove=remove, removed_by=rules)
 
 
-def scene_extent(camera_centers: Tensor, points: Tensor, cfg: DensityConfig) -> float:
-    """Length that separates small from large Gaussians, mm.
+def scene_extent(camera_centers: Tensor) -> float:
+    """Length that separates small from large Gaussians, mm: 1.1 times the radius of the camera centers (T, 3).
 
-    `camera`: 1.1 times the radius of the camera centers, as 3DGS has it; 0 for a still camera, so nothing is cloned.
-    `scene`: 1.1 times the largest distance of a point from the points' centroid; 0 without points.
-
-    Args:
-        camera_centers: (T, 3). points: (N, 3).
+    As 3DGS has it: 0 for a still camera, so that nothing is cloned.
     """
-    cloud = camera_centers if cfg.extent_mode == "camera" else points
-    return 1.1 * float((cloud - cloud.mean(0)).norm(dim=-1).max()) if len(cloud) else 0.0
+    return 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
 
 
 def apply_plan(
@@ -114,7 +125,7 @@ def apply_plan(
         Diverged: a new Gaussian would not be finite; nothing was changed.
     """
     tensors = optimizer.gaussians.tensors
-    children = split_children(optimizer.gaussians, plan.split, optimizer.cfg.density.split_shrink, rng)
+    children = split_children(optimizer.gaussians, plan.split, SPLIT_SHRINK, rng)
     added = {name: torch.cat([value.detach()[plan.clone], children[name]]) for name, value in tensors.items()}
     if not all(bool(value.isfinite().all()) for value in added.values()):
         raise Diverged(f"expected Gaussians of a finite size to split; got others. {ADVICE}")

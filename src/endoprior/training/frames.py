@@ -8,12 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.config import PriorConfig
 from ..core.types import Camera, Frame
 from ..data import FrameSequence, shrunk
 from ..initialization.sampling import has_surface
 from ..initialization.unseen import convex_hull
-from ..priors import joint_texture_prior
+from ..priors import Border, joint_texture_prior
 from ..system.memory import BoundedCache, cache_bytes
 
 TENSORS = ("rgb_u8", "tissue_mask", "hidden", "inverse_depth", "measured")
@@ -53,10 +52,11 @@ DEVICE_SHARE = 0.25  # share of a device's free memory that frames may take; fra
 class TrainingFrames:
     """Training frames of a sequence by position, built when first used, cached in memory and on the device."""
 
-    def __init__(self, sequence: FrameSequence, prior_cfg: PriorConfig, device: torch.device | str = "cpu") -> None:
+    def __init__(self, sequence: FrameSequence, border: Border = "reflect", device: torch.device | str = "cpu") -> None:
+        """Args: border: of the prior. device: where tensors are returned."""
         self.sequence, self.device = sequence, torch.device(device)
         self.indices = sequence.indices("train")
-        self._prior_cfg = prior_cfg
+        self._border: Border = border
         limits = cache_bytes(), device_bytes(self.device)
         self._frames, self._device_frames = (BoundedCache[TrainingFrame](limit, _frame_bytes) for limit in limits)
         self._priors, self._device_priors = (
@@ -89,7 +89,7 @@ class TrainingFrames:
 
         def build() -> Tensor:
             frame = self.sequence.frame(self.indices[position])
-            return torch.from_numpy(joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg))
+            return torch.from_numpy(joint_texture_prior(frame.rgb, frame.tissue_mask, border=self._border))
 
         if self.device.type == "cpu":
             prior = self._priors.get(position, build)

@@ -49,6 +49,9 @@ class GaussianMethod(Method):
     """Share of the pixels of the first training frame, where it shows tissue with depth, that become Gaussians; 0: it
     starts with `init.budget` of them."""
 
+    clone_extent = density.CLONE_EXTENT
+    """Gaussians with a scale up to this share of the scene extent are cloned, larger ones split."""
+
     def trainer(self, sequence: FrameSequence, cfg: Config) -> Trainer:
         """See `Method.trainer`."""
         return GaussianTrainer(sequence, cfg)
@@ -100,7 +103,8 @@ class GaussianMethod(Method):
         cfg: Config,
     ) -> Plan:
         """What to clone, split and remove; see `density.plan`."""
-        return density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg.density)
+        scales, opacities = gaussians.scales, gaussians.opacities
+        return density.plan(stats, scales, opacities, extent, cfg.density, cfg.released, self.clone_extent)
 
     def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
         """Whether opacities are lowered to 0.01 after this iteration."""

@@ -115,7 +115,7 @@ class GaussianTrainer(Trainer):
             check_cameras(self.cameras)
         except InputError as error:
             raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
-        frames = TrainingFrames(sequence, cfg.prior, self.device)
+        frames = TrainingFrames(sequence, "zero" if cfg.released.prior else "reflect", self.device)
         centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
         self.spatial_scale = spatial_scale(centers, cfg)
         self.step_once = TrainingStep(
@@ -204,7 +204,7 @@ class GaussianTrainer(Trainer):
             config=self.cfg,
             cameras=self.cameras,
             frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
-            prior_score=state.stats.score(self.cfg.density.unobserved_score).cpu(),
+            prior_score=state.stats.score(self.cfg.released.unobserved_score).cpu(),
             num_valid=state.stats.num_valid.cpu().clone(),
             lengths_are_relative=self.sequence.depth_is_relative,
             trained_from=trained[0] / num if holds else 0.0,
@@ -212,7 +212,11 @@ class GaussianTrainer(Trainer):
         )
 
 
+STILL_CAMERA_SCALE = 10.0
+"""Spatial scale of a sequence with a static camera."""
+
+
 def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:
     """Factor of the learning rates that are lengths: 1.1 x radius of the camera path; constant for a static one."""
     radius = 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
-    return radius if radius > 1e-3 else cfg.optim.still_camera_scale
+    return radius if radius > 1e-3 else STILL_CAMERA_SCALE

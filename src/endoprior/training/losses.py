@@ -108,17 +108,16 @@ def supervised_losses(
 
 def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, ops: TrainingOps) -> dict[str, Tensor]:
     """Weighted color, depth, total-variation and edge terms, and that of what is hidden, () each."""
-    depth = out.depth / out.alpha.clamp(min=1e-6) if cfg.depth_mode == "expected" else out.depth
     depth_weight = cfg.depth_weight if frame.num_measured >= cfg.min_depth_pixels else 0.0
     fused = ops.supervised_losses(
         out.color,
-        depth,
+        out.depth,
         frame.rgb_u8,
         frame.inverse_depth,
         frame.tissue_mask,
         frame.measured,
         (1.0, depth_weight, cfg.tv_weight, cfg.edge_weight),
-        cfg.tv_on_tissue,
+        not cfg.cover_weight,
     )
     names: list[str] = ["color", "depth", "tv", "edges"]
     terms = dict(zip(names, fused, strict=True))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.config import Config, OptimConfig
-from ..model.gaussians import ATTRIBUTES, Gaussians, motion_layout
+from ..model.gaussians import ATTRIBUTES, Gaussians, offset_widths
 from ..model.motion import Field, UnstoredGradient
 from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import LARGEST_GRADIENT
@@ -21,6 +21,26 @@ Rate = Callable[[int], float]
 """Learning rate at an iteration (1-based, within the stage)."""
 PLANES = "planes"
 """Name of the planes of a field, among the names of parameters."""
+RATES = {
+    "sh_dc": 2.5e-3,
+    "sh_rest": 1.25e-4,
+    "color_slopes": 2.5e-3,
+    "opacity_logits": 5e-2,
+    PLANES: 1.6e-3,
+    "box": 1.6e-3,
+}
+"""Initial rates that no config sets: those of 3DGS, and of EndoGaussian's planes and box."""
+NETWORK_LR = 1.6e-4
+"""Initial rate of trunk and heads (EndoGaussian)."""
+FINAL_SHARE = 0.01
+"""Share of the rates of centers, network and planes that is left at `decay_iterations`; log-linear in between."""
+BASIS_OPACITY_LR = 2e-2
+"""Rate of the temporal coefficients of opacities."""
+BASIS_DECAY = 0.1
+"""Share of the rates of temporal coefficients that is left at `decay_iterations`; log-linear in between."""
+EPSILON, BASIS_EPSILON = 1e-15, 1e-7
+"""Adam's epsilon, and that for temporal coefficients: else the faint gradient that leaks to what tools hide would move
+it as fast as any other."""
 LATE = 0.75
 """Share of `decay_iterations` after which the rates without a final value begin to fall."""
 
@@ -40,23 +60,23 @@ def late_share(optim: OptimConfig, iteration: int) -> float:
 def rate_of(name: str, cfg: Config, spatial_scale: float) -> Rate:
     """Rate of an attribute of the Gaussians, of a field's planes or box, or else of its network.
 
-    A rate with a final value is a length, so `spatial_scale` multiplies it, and decays all along; the others decay
-    late.
+    Rates of centers, planes and network are lengths: `spatial_scale` multiplies them, and they decay all along; the
+    others decay late.
     """
-    fields = {a.name: a.rate for a in ATTRIBUTES} | {PLANES: "planes_lr", "box": "planes_lr"}
-    field, optim = fields.get(name, "network_lr"), cfg.optim
-    start, end = getattr(optim, field), getattr(optim, f"{field}_final", None)
-    if end is None:
+    optim = cfg.optim
+    of_config = {"means": optim.means_lr, "quats": optim.quats_lr, "log_scales": optim.scales_lr}
+    start = (of_config | RATES).get(name, NETWORK_LR)
+    if name in {a.name for a in ATTRIBUTES} - {"means"}:
         return lambda iteration: start * late_share(optim, iteration)
-    return lambda iteration: spatial_scale * log_linear(start, end, iteration, optim.decay_iterations)
+    return lambda iteration: spatial_scale * log_linear(start, FINAL_SHARE * start, iteration, optim.decay_iterations)
 
 
 def motion_rates(cfg: Config, iteration: int) -> NDArray:
     """(C,) learning rate of each channel of the temporal coefficients."""
-    decay = log_linear(1.0, cfg.optim.basis_decay, iteration, cfg.optim.decay_iterations)
-    rates = {a.name: getattr(cfg.optim, a.basis_rate) for a in ATTRIBUTES if a.basis_rate}
-    layout = motion_layout(cfg.deformation)
-    return np.concatenate([np.full(part.stop - part.start, rates[name] * decay) for name, part in layout.items()])
+    decay = log_linear(1.0, BASIS_DECAY, iteration, cfg.optim.decay_iterations)
+    own = {"opacity_logits": BASIS_OPACITY_LR}
+    widths = offset_widths(cfg.deformation)
+    return np.concatenate([np.full(width, own.get(name, cfg.optim.basis_lr) * decay) for name, width in widths.items()])
 
 
 class Optimizer:
@@ -71,7 +91,7 @@ class Optimizer:
         self.rates = {name: rate_of(name) for name in self.states}
         if "motion" in gaussians.tensors:
             self.states["motion"] = AdamState(gaussians["motion"], gaussians["motion"].shape[1])
-        self.planes = PlaneAdam(field.grid, cfg.optim.epsilon) if field and field.grid else None
+        self.planes = PlaneAdam(field.grid, EPSILON) if field and field.grid else None
         if self.planes:
             self.rates[PLANES] = rate_of(PLANES)
 
@@ -82,7 +102,7 @@ class Optimizer:
             iteration: 1-based, within the stage.
             skip: () float32 on a device; where it is 1 the gradients are only cleared.
         """
-        epsilon, by_rate = self.cfg.optim.epsilon, defaultdict(list)
+        epsilon, by_rate = EPSILON, defaultdict(list)
         for name, param in self._dense().items():
             if param.grad is not None and param.numel():
                 by_rate[self.rates[name](iteration)].append((self.states[name], param))
@@ -99,9 +119,9 @@ class Optimizer:
         if isinstance(gradients[0], UnstoredGradient):
             names = gradients[0].names
             states, params = [self.states[name] for name in names], [gaussians[name] for name in names]
-            adam_unstored_step(states, params, gradients, self.rates[names[0]](iteration), self.cfg.optim.epsilon)
+            adam_unstored_step(states, params, gradients, self.rates[names[0]](iteration), EPSILON)
         else:
-            rates, epsilon = motion_rates(self.cfg, iteration), self.cfg.optim.basis_epsilon
+            rates, epsilon = motion_rates(self.cfg, iteration), BASIS_EPSILON
             self._ops.adam_basis_step(self.states["motion"], gaussians["motion"], gradients, rates, epsilon, skip)
 
     def count_unusable(self) -> dict[str, int | Tensor]:

@@ -180,7 +180,7 @@ class TrainingStep:
         """Add to the running statistics: the gradient always, the prior's score where it is sampled."""
         camera, skip, cfg = drawn.frame.camera, self.check.skip, self.cfg.density
         self.ops.add_gradient(state.stats, drawn.out, camera.width, camera.height, skip)
-        sampled = cfg.score_mode == "every" or density.due(drawn.iteration, False, cfg)
+        sampled = not self.cfg.released.prior or density.due(drawn.iteration, False, cfg)
         if sampled and self.method.uses_prior and not drawn.is_right:
             prior, tissue_mask = self.frames.prior(drawn.position)
             scale, opacities = prior.shape[1] / camera.width, state.gaussians.opacities
@@ -191,13 +191,13 @@ class TrainingStep:
     def _update(self, state: GaussiansState, drawn: Drawn) -> None:
         """Apply the gradients."""
         state.optimizer.step(drawn.iteration, self.check.skip)
-        share = self.cfg.density.max_scale_share
-        if share:
-            limit_scales(state.gaussians["log_scales"].detach(), drawn.splats.means, drawn.frame.camera, share)
+        if self.cfg.deformation.max_scale_change > 1:
+            log_scales = state.gaussians["log_scales"].detach()
+            limit_scales(log_scales, drawn.splats.means, drawn.frame.camera, MAX_SCALE_SHARE)
 
     def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
         gaussians = state.gaussians
-        extent = density.scene_extent(self.camera_centers, gaussians["means"], self.cfg.density)
+        extent = density.scene_extent(self.camera_centers)
         planned = self.method.plan(state.stats, gaussians, extent, state.stage, iteration, self.cfg)
         if bool(planned.remove.all()):
             lost = f"after iteration {iteration} all {len(planned.remove):,} faded"
@@ -213,6 +213,10 @@ def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
     if stage is Stage.FINE:
         done += cfg.schedule.coarse_iterations // cfg.schedule.sh_every
     return min(done, cfg.schedule.sh_degree)
+
+
+MAX_SCALE_SHARE = 0.025
+"""Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned."""
 
 
 def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float) -> None:

@@ -24,6 +24,18 @@ if TYPE_CHECKING:
     from .ops import TrainingOps
     from .step import Before, Drawn
 
+NUM_NEIGHBORS = 8
+"""K."""
+DISPLACEMENT_WEIGHT, DISTANCE_WEIGHT = 1.0, 0.2
+"""lambda_disp and lambda_dist."""
+HUBER_DELTA = 0.01
+"""delta of Huber's penalty, mm."""
+MOTION_THRESHOLD, MOTION_TEMPERATURE = 0.45, 0.08
+"""tau_m and gamma_m of Eq. (9)."""
+MOST_POINTS = 1024
+"""Gaussians that are sampled by weight for an iteration that trains one time."""
+MIN_EFFECTIVE = 256
+"""Effective sample size that the released code relaxes the weights for."""
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
 EVALUATIONS, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
@@ -48,18 +60,18 @@ def effective_size(weights: NDArray) -> float:
     return float(weights.sum()) ** 2 / square if square > 0 else 0.0
 
 
-def relaxed_motion_weight(score: NDArray, cfg: TemporalConfig) -> NDArray:
-    """Eq. (9), with tau_m lowered and gamma_m raised until enough Gaussians count (released code).
+def kept_motion_weight(score: NDArray, relaxed: bool = False) -> NDArray:
+    """Eq. (9); `relaxed` lowers tau_m and raises gamma_m until enough Gaussians count (released code).
 
     Args:
         score: (N,) in [0, 1], of the candidates only: others must not count as effective.
     Returns:
         (N,) weights; those up to `MIN_WEIGHT` are 0.
     """
-    threshold, temperature = cfg.motion_threshold, cfg.motion_temperature
+    threshold, temperature = MOTION_THRESHOLD, MOTION_TEMPERATURE
     weights = motion_weight(score, threshold, temperature)
-    for _ in range(EVALUATIONS - 1 if cfg.adaptive_motion_weight else 0):
-        if effective_size(weights) >= cfg.min_effective:
+    for _ in range(EVALUATIONS - 1 if relaxed else 0):
+        if effective_size(weights) >= MIN_EFFECTIVE:
             break
         threshold = max(threshold - RELAX_THRESHOLD_STEP, RELAX_THRESHOLD_FLOOR)
         temperature = min(temperature * RELAX_TEMPERATURE_FACTOR, RELAX_TEMPERATURE_CAP)
@@ -89,7 +101,9 @@ def systematic_sample(weights: NDArray, count: int, refill: bool = False) -> NDA
     return positive[hit]
 
 
-def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDArray[np.intp], NDArray]:
+def choose(
+    score: NDArray, eligible: NDArray, cfg: TemporalConfig, released: bool = False
+) -> tuple[NDArray[np.intp], NDArray]:
     """The Gaussians that take part in one iteration, and their motion weights.
 
     Args:
@@ -99,8 +113,8 @@ def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDAr
     """
     candidates = np.flatnonzero(eligible)
     score = score[candidates]
-    weights = relaxed_motion_weight(score, cfg) if cfg.pair_weights else np.ones_like(score)
-    chosen = systematic_sample(weights, cfg.max_points or len(weights), cfg.refill)
+    weights = np.ones_like(score) if cfg.without == "pair_weights" else kept_motion_weight(score, released)
+    chosen = systematic_sample(weights, len(weights) if cfg.gradient == "both" else MOST_POINTS, released)
     if len(chosen) < least_points(cfg):
         chosen = chosen[:0]
     return candidates[chosen], weights[chosen]
@@ -108,7 +122,7 @@ def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDAr
 
 def least_points(cfg: TemporalConfig) -> int:
     """Fewest Gaussians with which the term is computed."""
-    return max(cfg.min_points, cfg.num_neighbors + 1)
+    return max(cfg.min_points, NUM_NEIGHBORS + 1)
 
 
 def temporal_terms(
@@ -117,26 +131,27 @@ def temporal_terms(
     """L_local of Eq. (11), weighted, () each; nothing with few Gaussians."""
     temporal, out, means = cfg.temporal, drawn.out, drawn.splats.means
     seen = out.radii > 0
-    if temporal.valid_at_both:
+    both = temporal.gradient == "both"
+    if both:
         seen = ops.valid_projection(out.means2d, out.radii, before.tissue_now)
     eligible = seen & (stats.num_valid >= temporal.min_valid)
-    score = stats.score(cfg.density.unobserved_score)
+    score = stats.score(cfg.released.unobserved_score)
     index, weights = (
         torch.from_numpy(each).to(means.device)
-        for each in choose(score.cpu().numpy(), eligible.cpu().numpy(), temporal)
+        for each in choose(score.cpu().numpy(), eligible.cpu().numpy(), temporal, cfg.released.prior)
     )
     if not len(index):
         return {}
     earlier = _means_before(drawn, before, motion, index, cfg, ops)
-    if temporal.valid_at_both:
+    if both:
         kept = _on_tissue(earlier.detach(), before.frame, ops)
         index, weights, earlier = index[kept], weights[kept], earlier[kept]
         if len(index) < least_points(temporal):
             return {}
-    displacement, distance = ops.local_consistency(means[index], earlier, weights, temporal)
+    displacement, distance = ops.local_consistency(means[index], earlier, weights, cfg.released.prior)
     return {
-        "displacement": temporal.weight * temporal.displacement_weight * displacement,
-        "distance": temporal.weight * temporal.distance_weight * distance,
+        "displacement": temporal.weight * DISPLACEMENT_WEIGHT * displacement,
+        "distance": temporal.weight * (0.0 if temporal.without == "distance" else DISTANCE_WEIGHT) * distance,
     }
 
 
@@ -159,7 +174,7 @@ def _on_tissue(points: Tensor, frame: TrainingFrame, ops: TrainingOps) -> Tensor
     return ops.valid_projection(means2d.to(points.device), in_front.to(points.device), frame.tissue_mask)
 
 
-def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
+def local_consistency(now: Tensor, before: Tensor, weights: Tensor, smooth_l1: bool = False) -> tuple[Tensor, Tensor]:
     """L_local, Eq. (11), unweighted: neighbors are found and weighed at t - dt, then compared.
 
     Args:
@@ -168,8 +183,8 @@ def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: Tempora
     Returns:
         Mean |d_i - d_j| (mm) and mean Huber penalty of the change of |mu_i - mu_j|, both weighted by w_ij.
     """
-    indices, distances = neighbors(before.detach(), cfg.num_neighbors)
-    return local_motion(now, before, indices, affinity(distances, indices, weights), cfg)
+    indices, distances = neighbors(before.detach(), NUM_NEIGHBORS)
+    return local_motion(now, before, indices, affinity(distances, indices, weights), smooth_l1)
 
 
 def neighbors(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -197,7 +212,7 @@ def affinity(distances: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
 
 
 def local_motion(
-    now: Tensor, before: Tensor, indices: Tensor, pair_weights: Tensor, cfg: TemporalConfig
+    now: Tensor, before: Tensor, indices: Tensor, pair_weights: Tensor, smooth_l1: bool = False
 ) -> tuple[Tensor, Tensor]:
     """The two weighted means of Eq. (11), displacement and distance, of given (P, K) neighbors and pair weights."""
     weight = pair_weights.to(now.dtype)
@@ -206,13 +221,13 @@ def local_motion(
     difference = displacement[:, None] - displacement[indices]
     apart = (difference.square().sum(-1) + SQRT_EPS).sqrt()
     stretch = (_length(now[:, None] - now[indices]) - _length(before[:, None] - before[indices])).abs()
-    return (weight * apart).sum(), (weight * huber(stretch, cfg.huber_delta, cfg.huber_scale)).sum()
+    return (weight * apart).sum(), (weight * huber(stretch, HUBER_DELTA, smooth_l1)).sum()
 
 
-def huber(x: Tensor, delta: float, scale: str) -> Tensor:
-    """Huber's penalty of x >= 0: x^2 / 2 up to delta, delta (x - delta / 2) above; `released` divides it by delta."""
+def huber(x: Tensor, delta: float, smooth_l1: bool = False) -> Tensor:
+    """Huber's penalty of x >= 0: x^2 / 2 up to delta, delta (x - delta / 2) above; `smooth_l1` divides it by delta."""
     literal = torch.where(x <= delta, 0.5 * x * x, delta * (x - 0.5 * delta))
-    return literal / delta if scale == "released" else literal
+    return literal / delta if smooth_l1 else literal
 
 
 def _length(vectors: Tensor) -> Tensor:

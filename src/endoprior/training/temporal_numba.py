@@ -21,16 +21,15 @@ from torch.autograd.function import once_differentiable
 from ..compute.fastmath import REORDERED
 from ..compute.neighbors import MAX_COORDINATE, nearest
 from ..core.checks import check_shape
-from ..core.config import TemporalConfig
-from .temporal import SQRT_EPS, SUM_EPS
+from .temporal import HUBER_DELTA, NUM_NEIGHBORS, SQRT_EPS, SUM_EPS
 
 _POINTS_PER_TASK = 256
 
 
-def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
+def local_consistency(now: Tensor, before: Tensor, weights: Tensor, smooth_l1: bool = False) -> tuple[Tensor, Tensor]:
     """See `temporal.local_consistency`."""
-    indices, distances = neighbors(before.detach().numpy(), cfg.num_neighbors)
-    return local_motion(now, before, indices, affinity(distances, indices, weights.numpy()), cfg)
+    indices, distances = neighbors(before.detach().numpy(), NUM_NEIGHBORS)
+    return local_motion(now, before, indices, affinity(distances, indices, weights.numpy()), smooth_l1)
 
 
 def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
@@ -60,7 +59,7 @@ def affinity(distances: NDArray[np.float64], indices: NDArray[np.intp], weights:
 
 
 def local_motion(
-    now: Tensor, before: Tensor, indices: NDArray[np.intp], pair_weights: NDArray, cfg: TemporalConfig
+    now: Tensor, before: Tensor, indices: NDArray[np.intp], pair_weights: NDArray, smooth_l1: bool = False
 ) -> tuple[Tensor, Tensor]:
     """See `temporal.local_motion`; the gradient flows to `now` and `before`.
 
@@ -78,8 +77,8 @@ def local_motion(
         raise ValueError(f"before must have the type of now, {now.dtype}; got {before.dtype}")
     if not 0 <= indices.min() <= indices.max() < len(now):
         raise ValueError(f"indices must be in [0, {len(now) - 1}]; got {indices.min()} to {indices.max()}")
-    factor = 1 / cfg.huber_delta if cfg.huber_scale == "released" else 1.0
-    return _LocalMotion.apply(now, before, indices, pair_weights, cfg.huber_delta, factor)
+    factor = 1 / HUBER_DELTA if smooth_l1 else 1.0
+    return _LocalMotion.apply(now, before, indices, pair_weights, HUBER_DELTA, factor)
 
 
 class _LocalMotion(torch.autograd.Function):

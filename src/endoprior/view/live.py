@@ -23,7 +23,7 @@ LARGEST_SHARE = 0.2
 
 
 class LiveView:
-    """An `on_step` callback of `runs.training_run.train` that updates a viewer."""
+    """An `on_step` callback of `runs.train.train` that updates a viewer."""
 
     def __init__(self, host: str, port: int) -> None:
         """The server starts after the first iteration.

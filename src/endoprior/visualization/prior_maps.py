@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config import PriorConfig
 from ..data import FrameSequence, Split
 from ..priors import joint_texture_prior, salience, specular_likelihood
 from ..system.atomic import reject_occupied, whole_folder
@@ -18,7 +17,7 @@ SHEET_FRAMES = 6
 SHEET_WIDTH_PX = 320
 
 
-def write_prior_maps(sequence: FrameSequence, split: Split, cfg: PriorConfig, out: Path) -> Path:
+def write_prior_maps(sequence: FrameSequence, split: Split, out: Path) -> Path:
     """Write `specular/`, `salience/` and `prior/` (gray, 255 = 1) and `contact_sheet.png` into `out`.
 
     Returns:
@@ -33,9 +32,9 @@ def write_prior_maps(sequence: FrameSequence, split: Split, cfg: PriorConfig, ou
     with whole_folder(out) as folder:
         for position, frame in enumerate(frames):
             maps = {
-                "specular": specular_likelihood(frame.rgb, cfg.specular),
-                "salience": salience(frame.rgb, frame.tissue_mask, cfg.salience),
-                "prior": joint_texture_prior(frame.rgb, frame.tissue_mask, cfg),
+                "specular": specular_likelihood(frame.rgb),
+                "salience": salience(frame.rgb, frame.tissue_mask),
+                "prior": joint_texture_prior(frame.rgb, frame.tissue_mask),
             }
             for name, values in maps.items():
                 write_png(folder / name / f"{frame.index:06d}.png", to_u8(values))

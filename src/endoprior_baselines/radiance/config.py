@@ -34,5 +34,3 @@ class RadianceFieldConfig(Config):
     """See `Config`."""
 
     radiance: RadianceConfig = field(default_factory=RadianceConfig)
-
-    FORMER_FIELDS = ("poses", "loss.fit_relative_depth")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from endoprior.core.config import Config
+from endoprior.model.presets import paper
 
 from .config import RadianceConfig, RadianceFieldConfig
 
@@ -32,5 +33,5 @@ def endosurf_published() -> Config:
 
 
 def _config(method: str, iterations: int, radiance: RadianceConfig) -> Config:
-    base = RadianceFieldConfig(method=method, radiance=radiance)
+    base = RadianceFieldConfig(**vars(paper()) | {"method": method, "radiance": radiance})
     return replace(base, schedule=replace(base.schedule, coarse_iterations=0, fine_iterations=iterations))
