@@ -6,7 +6,7 @@ import pytest
 
 from endoprior.compute.morton import curve_order
 from endoprior.compute.neighbors import MAX_COORDINATE
-from endoprior.training.temporal_numba import neighbors
+from endoprior.training.local_motion import neighbors_numba as neighbors
 
 NUM = 700
 """Points of a cloud."""

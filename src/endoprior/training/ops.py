@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..model import ops as model_ops
-from . import adam, density_stats, losses, temporal, temporal_numba
+from . import adam, density_stats, local_motion, losses
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class TrainingOps:
 NUMBA = TrainingOps(
     model=model_ops.NUMBA,
     supervised_losses=losses.supervised_losses_numba,
-    local_consistency=temporal_numba.local_consistency,
+    local_consistency=local_motion.local_consistency_numba,
     add_gradient=density_stats.add_gradient_numba,
     add_score=density_stats.add_score_numba,
     valid_projection=density_stats.valid_projection_numba,
@@ -48,7 +48,7 @@ NUMBA = TrainingOps(
 TORCH = TrainingOps(
     model=model_ops.TORCH,
     supervised_losses=losses.supervised_losses,
-    local_consistency=temporal.local_consistency,
+    local_consistency=local_motion.local_consistency,
     add_gradient=density_stats.add_gradient,
     add_score=density_stats.add_score,
     valid_projection=density_stats.valid_projection,
