@@ -50,7 +50,7 @@ def unseen_points(
         if not len(new):
             continue
         found_near = KDTree(moved).query(new, k=min(CARRIERS, len(moved)))
-        distances, nearest = (each.reshape(len(new), -1) for each in found_near)
+        distances, nearest = (np.reshape(each, (len(new), -1)) for each in found_near)
         motion = np.einsum("mk,mkbc->mbc", weights_by_distance(distances), coefficients[nearest]).astype(np.float32)
         points = (new - _displacement(motion, weights)).astype(np.float32)
         found.append(PointCloud(points, colors.astype(np.float32), np.full(len(new), position, np.int32)))

@@ -75,32 +75,22 @@ def plan(
         clone_extent: share of the extent up to which a Gaussian is cloned, not split.
     """
     released = released or ReleasedMethod()
-    largest_mm, by_prior = released.prune_max_scale_mm, cfg.min_densify_weight < 1
-    score = stats.score(released.unobserved_score)
+    largest_mm, by_prior = released.prune_max_scale_mm or math.inf, cfg.min_densify_weight < 1
+    score, largest = stats.score(released.unobserved_score), scales.amax(-1)
     gradient = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1)
-    largest = scales.amax(-1)
-    faint = opacities < cfg.prune_opacity
-    huge = largest > largest_mm if largest_mm > 0 else torch.zeros_like(faint)
-    distrusted = torch.zeros_like(faint)
-    if by_prior:
-        distrusted = (
-            (stats.num_valid >= cfg.min_valid)
-            & (score < cfg.prior_threshold)
-            & (stats.mean_opacity(opacities) < PRIOR_OPACITY)
-        )
+    faint, huge = opacities < cfg.prune_opacity, largest > largest_mm
+    unlikely = (score < cfg.prior_threshold) & (stats.mean_opacity(opacities) < PRIOR_OPACITY)
+    distrusted = (stats.num_valid >= cfg.min_valid) & unlikely if by_prior else torch.zeros_like(faint)
+    condemned = faint | huge | distrusted
     grow = (densify_weight(score, cfg) * gradient >= cfg.grow_threshold) & ~faint
     small = largest <= clone_extent * extent
     # Pruning follows growth: children are smaller and unobserved, so only their size can condemn them.
-    children_huge = huge & (largest / SPLIT_SHRINK > largest_mm)
-    split = grow & ~small & ~children_huge
-    clone = grow & small & ~huge & ~distrusted
-    remove = (faint | huge | distrusted) & ~split
+    split = grow & ~small & (largest / SPLIT_SHRINK <= largest_mm)
+    clone, remove = grow & small & ~condemned, condemned & ~split
     if len(scales) + int(clone.sum()) + int(split.sum()) - int(remove.sum()) > MAX_GAUSSIANS:
-        clone, split = torch.zeros_like(clone), torch.zeros_like(split)
-        remove = faint | huge | distrusted
-    rules = {"opacity": faint} | ({"size": huge} if largest_mm else {})
-    rules |= {"prior": distrusted} if by_prior else {}
-    return Plan(clone=clone, split=split, remove=remove, removed_by=rules)
+        clone, split, remove = torch.zeros_like(clone), torch.zeros_like(split), condemned
+    rules = {"opacity": faint} | ({"size": huge} if released.prune_max_scale_mm else {})
+    return Plan(clone, split, remove, rules | ({"prior": distrusted} if by_prior else {}))
 
 
 def scene_extent(camera_centers: Tensor) -> float:

@@ -27,6 +27,7 @@ from ..model.motion import Field, Motion
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
+from .density import scene_extent
 from .density_stats import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
@@ -39,6 +40,8 @@ from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, devi
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
+
+STILL_CAMERA_SCALE = 10.0  # spatial scale of a sequence with a static camera
 
 
 @dataclass
@@ -117,13 +120,14 @@ class GaussianTrainer(Trainer):
             raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
         frames = TrainingFrames(sequence, "zero" if cfg.released.prior else "reflect", self.device)
         centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
-        self.spatial_scale = spatial_scale(centers, cfg)
+        extent = scene_extent(centers)
+        self.spatial_scale = extent if extent > 1e-3 else STILL_CAMERA_SCALE  # of learning rates that are lengths
         self.step_once = TrainingStep(
             method=self.method,
             motion=self.motion,
             cfg=self.cfg,
             frames=frames,
-            camera_centers=centers,
+            extent=extent,
             rasterize=render.load(cfg.render.backend),
             ops=self.ops,
             check=DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
@@ -161,12 +165,7 @@ class GaussianTrainer(Trainer):
         self.state.stats = DensityStats(**stats)
 
     def _enter(
-        self,
-        stage: Stage,
-        gaussians: Gaussians,
-        field: Field | None,
-        tracks: StartTracks | None,
-        shares: Tensor | None,
+        self, stage: Stage, gaussians: Gaussians, field: Field | None, tracks: StartTracks | None, shares: Tensor | None
     ) -> None:
         rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
         optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
@@ -210,13 +209,3 @@ class GaussianTrainer(Trainer):
             trained_from=trained[0] / num if holds else 0.0,
             trained_until=trained[-1] / num if holds else 1.0,
         )
-
-
-STILL_CAMERA_SCALE = 10.0
-"""Spatial scale of a sequence with a static camera."""
-
-
-def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:
-    """Factor of the learning rates that are lengths: 1.1 x radius of the camera path; constant for a static one."""
-    radius = 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
-    return radius if radius > 1e-3 else STILL_CAMERA_SCALE

@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
     from .gaussian_trainer import GaussiansState
 
-RESET_OPACITY = 0.01
-"""Where methods that reset opacities lower them to (3DGS)."""
+RESET_OPACITY = 0.01  # where methods that reset opacities lower them to (3DGS)
+MAX_SCALE_SHARE = 0.025
+"""Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned."""
 
 
 class Before(NamedTuple):
@@ -74,7 +75,7 @@ class TrainingStep:
     motion: Motion  # that of the method
     cfg: Config
     frames: TrainingFrames
-    camera_centers: Tensor  # (T, 3) camera positions of the training frames, mm
+    extent: float  # see `density.scene_extent`
     rasterize: Rasterizer
     ops: TrainingOps
     check: DivergenceCheck
@@ -196,9 +197,7 @@ class TrainingStep:
             limit_scales(log_scales, drawn.splats.means, drawn.frame.camera, MAX_SCALE_SHARE)
 
     def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
-        gaussians = state.gaussians
-        extent = density.scene_extent(self.camera_centers)
-        planned = self.method.plan(state.stats, gaussians, extent, state.stage, iteration, self.cfg)
+        planned = self.method.plan(state.stats, state.gaussians, self.extent, state.stage, iteration, self.cfg)
         if bool(planned.remove.all()):
             lost = f"after iteration {iteration} all {len(planned.remove):,} faded"
             raise Diverged(f"expected Gaussians that explain the frames; {lost}. {ADVICE}")
@@ -213,10 +212,6 @@ def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
     if stage is Stage.FINE:
         done += cfg.schedule.coarse_iterations // cfg.schedule.sh_every
     return min(done, cfg.schedule.sh_degree)
-
-
-MAX_SCALE_SHARE = 0.025
-"""Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned."""
 
 
 def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float) -> None:
