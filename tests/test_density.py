@@ -105,15 +105,11 @@ def test_score_agrees_with_grid_sample(scale):
     assert torch.equal(found, stats.num_valid > 0)
 
 
-@pytest.mark.parametrize("unobserved", [0.0, 1.0])
-def test_unobserved_gaussians_get_the_configured_score(unobserved):
-    assert DensityStats.zeros(2).score(unobserved).tolist() == [unobserved] * 2
-
-
 @pytest.mark.parametrize(("unobserved", "factor"), [(0.0, 0.35), (1.0, 1.0)])
-def test_factor_of_an_unobserved_gaussian(unobserved, factor):
-    weight = density.densify_weight(DensityStats.zeros(1).score(unobserved), CFG)
-    assert weight.item() == pytest.approx(factor)
+def test_score_and_factor_of_an_unobserved_gaussian(unobserved, factor):
+    score = DensityStats.zeros(2).score(unobserved)
+    assert score.tolist() == [unobserved] * 2
+    assert density.densify_weight(score, CFG).tolist() == pytest.approx([factor] * 2)
 
 
 def test_gradient_is_counted_in_ndc_and_only_where_drawn():
@@ -125,32 +121,36 @@ def test_gradient_is_counted_in_ndc_and_only_where_drawn():
     assert stats.num_seen.tolist() == [1, 0]
 
 
-def test_nothing_is_cloned_at_extent_zero():
-    stats = stats_of(4, gradient=1.0, score=1.0, num_valid=1)
-    scales = torch.full((4, 3), 1e-3)
-    planned = density.plan(stats, scales, torch.full((4,), 0.5), 0.0, CFG)
-    assert planned.split.all() and not planned.clone.any() and not planned.remove.any()
+GROWING = {"gradient": 1.0, "score": 1.0, "num_valid": 1}
+LIMITED = ReleasedMethod(prune_max_scale_mm=40.0)
 
 
-def test_small_gaussians_are_cloned_in_a_large_scene():
-    stats = stats_of(2, gradient=1.0, score=1.0, num_valid=1)
-    scales = torch.tensor([[0.5, 0.1, 0.1], [5.0, 0.1, 0.1]])
-    planned = density.plan(stats, scales, torch.full((2,), 0.5), 100.0, CFG)
-    assert planned.clone.tolist() == [True, False] and planned.split.tolist() == [False, True]
+@pytest.mark.parametrize(
+    ("largest", "opacities", "extent", "released", "known", "does"),
+    [
+        ([1e-3] * 3, 0.5, 0.0, None, GROWING, "sss"),  # nothing is cloned at extent zero
+        ([0.5, 5.0], 0.5, 100.0, None, GROWING, "cs"),  # small ones are cloned in a large scene
+        ([1.0, 41.0, 1.0], [0.004, 0.5, 0.5], 0.0, LIMITED, {}, "rr."),  # faint and huge ones go
+        ([50.0, 70.0], 0.5, 0.0, LIMITED, GROWING, "sr"),  # the children of the first one fit
+        ([1.0, 1.0], 0.5, 0.0, None, {"gradient": [4e-4, 6e-4], "score": 0.0, "num_valid": 5}, ".s"),  # 0.35 x 6e-4
+        ([1.0, 1.0], 0.5, 0.0, None, {"gradient": [1.9e-4, 2.1e-4], "score": 1.0, "num_valid": 10**6}, ".s"),
+    ],
+)
+def test_what_a_plan_does_to_each(largest, opacities, extent, released, known, does):
+    """`c` clone, `s` split, `r` remove; the longest axis of each Gaussian is given."""
+    num = len(largest)
+    known = known | {"gradient": torch.tensor(known.get("gradient", 0.0))}
+    scales = torch.tensor(largest)[:, None] * torch.tensor([1.0, 0.2, 0.2])
+    planned = density.plan(stats_of(num, **known), scales, torch.tensor(opacities).expand(num), extent, CFG, released)
+    for letter, rows in (("c", planned.clone), ("s", planned.split), ("r", planned.remove)):
+        assert rows.tolist() == [each == letter for each in does], letter
 
 
-@pytest.mark.parametrize("cfg", [replace(CFG, min_densify_weight=1.0), CFG])
-def test_score_one_or_floor_one_is_plain_growth(cfg):
-    gradient = torch.tensor([1.9e-4, 2.1e-4])
-    stats = stats_of(2, gradient=gradient, score=1.0, num_valid=10**6)
+def test_a_floor_of_one_is_plain_growth():
+    stats = stats_of(2, gradient=torch.tensor([1.9e-4, 2.1e-4]), score=0.0, num_valid=10**6)
+    cfg = replace(CFG, min_densify_weight=1.0)
     planned = density.plan(stats, torch.ones(2, 3), torch.full((2,), 0.5), 0.0, cfg)
     assert planned.split.tolist() == [False, True]
-
-
-def test_a_low_score_raises_the_bar():
-    stats = stats_of(2, gradient=torch.tensor([4e-4, 6e-4]), score=0.0, num_valid=5)
-    planned = density.plan(stats, torch.ones(2, 3), torch.full((2,), 0.5), 0.0, CFG)
-    assert planned.split.tolist() == [False, True]  # 0.35 x 6e-4 > 2e-4 > 0.35 x 4e-4
 
 
 @pytest.mark.parametrize(
@@ -159,24 +159,8 @@ def test_a_low_score_raises_the_bar():
 )
 def test_prior_prune_needs_all_three(num_valid, score, opacity, gone):
     stats = stats_of(1, score=score, num_valid=num_valid, opacity=opacity)
-    planned = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, CFG)
-    assert planned.remove.item() is gone
-    off = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, replace(CFG, min_densify_weight=1.0))
-    assert not off.remove.item()
-
-
-def test_faint_and_huge_gaussians_go():
-    released = ReleasedMethod(prune_max_scale_mm=40.0)
-    scales = torch.tensor([[1.0] * 3, [41.0] * 3, [1.0] * 3])
-    planned = density.plan(stats_of(3), scales, torch.tensor([0.004, 0.5, 0.5]), 0.0, CFG, released)
-    assert planned.remove.tolist() == [True, True, False]
-
-
-def test_a_huge_gaussian_whose_children_fit_is_split():
-    released = ReleasedMethod(prune_max_scale_mm=40.0)
-    stats = stats_of(2, gradient=1.0, score=1.0, num_valid=1)
-    planned = density.plan(stats, torch.tensor([[50.0] * 3, [70.0] * 3]), torch.full((2,), 0.5), 0.0, CFG, released)
-    assert planned.split.tolist() == [True, False] and planned.remove.tolist() == [False, True]
+    for cfg, goes in ((CFG, gone), (replace(CFG, min_densify_weight=1.0), False)):
+        assert density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, cfg).remove.item() is goes
 
 
 def test_growth_stops_at_the_guard(monkeypatch):

@@ -29,30 +29,20 @@ def loss(now, before, weights=None):
     return local_motion_numba(now, before, indices, affinity_numba(distances, indices, weights))
 
 
-def test_motion_weight_is_half_at_the_threshold():
+def test_weights_and_samples_by_hand():
     assert temporal.motion_weight(np.array([0.45]), 0.45, 0.08)[0] == pytest.approx(0.5)
+    assert temporal.kept_motion_weight(np.array([-1.0]))[0] == 0, "up to the least one"
+    assert temporal.systematic_sample(np.array([0, 1.0, 0, 2.0]), 5).tolist() == [1, 3]
 
 
-def test_relaxation_lowers_the_threshold_until_enough_count():
+def test_relaxation_lowers_the_threshold_until_enough_count_or_to_its_floor():
     score = np.full(1000, 0.1)
     score[:20] = 0.9
-    fixed = temporal.kept_motion_weight(score)
-    relaxed = temporal.kept_motion_weight(score, relaxed=True)
+    fixed, relaxed = (temporal.kept_motion_weight(score, relaxed=relaxed) for relaxed in (False, True))
     assert temporal.effective_size(relaxed) >= temporal.MIN_EFFECTIVE > temporal.effective_size(fixed)
-
-
-def test_relaxation_stops_at_its_floor():
-    weights = temporal.kept_motion_weight(np.zeros(10), relaxed=True)
     # After eight tries: threshold 0.25, temperature 0.30.
-    assert weights == pytest.approx(temporal.motion_weight(np.zeros(10), 0.25, 0.30))
-
-
-def test_weights_up_to_the_least_one_are_dropped():
-    assert temporal.kept_motion_weight(np.array([-1.0]))[0] == 0
-
-
-def test_systematic_sample_takes_all_when_they_fit():
-    assert temporal.systematic_sample(np.array([0, 1.0, 0, 2.0]), 5).tolist() == [1, 3]
+    floor = temporal.motion_weight(np.zeros(10), 0.25, 0.30)
+    assert temporal.kept_motion_weight(np.zeros(10), relaxed=True) == pytest.approx(floor)
 
 
 def test_systematic_sample_follows_the_weights():
