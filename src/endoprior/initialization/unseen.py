@@ -49,9 +49,10 @@ def unseen_points(
         new, colors = _fill(frame, np.concatenate([moved, *added]), within)
         if not len(new):
             continue
-        found_near = KDTree(moved).query(new, k=min(CARRIERS, len(moved)))
-        distances, nearest = (np.reshape(each, (len(new), -1)) for each in found_near)
-        motion = np.einsum("mk,mkbc->mbc", weights_by_distance(distances), coefficients[nearest]).astype(np.float32)
+        distances, nearest = KDTree(moved).query(new, k=min(CARRIERS, len(moved)))
+        near = weights_by_distance(np.reshape(distances, (len(new), -1)).astype(np.float64))
+        carriers = coefficients[np.reshape(nearest, (len(new), -1))]
+        motion = np.einsum("mk,mkbc->mbc", near, carriers).astype(np.float32)
         points = (new - _displacement(motion, weights)).astype(np.float32)
         found.append(PointCloud(points, colors.astype(np.float32), np.full(len(new), position, np.int32)))
         motions.append(motion)
