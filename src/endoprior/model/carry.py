@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..core.types import Camera
@@ -96,7 +96,7 @@ def _carry_in(
     for start in np.unique(from_stop):
         tied = from_stop == start
         centers = _centers(scene, scene.gaussians, times[start])
-        found = cKDTree(centers).query(points[tied], k=k, workers=1)
+        found = KDTree(centers).query(points[tied], k=k, workers=1)
         distances[tied], carriers[tied] = (part.reshape(-1, k) for part in found)
     opacities = scene.gaussians.opacities.detach().cpu().numpy()
     width = np.maximum(distances.mean(1, keepdims=True), 1e-6)

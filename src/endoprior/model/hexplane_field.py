@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from copy import copy
-from typing import ClassVar, Self
+from typing import ClassVar, Self, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import linear, relu
 from torch.nn.init import xavier_uniform_
+from typing_extensions import override
 
 from ..core.checks import InputError, check_shape
 from ..core.config import Config
@@ -113,14 +114,18 @@ class HexPlaneField(Field):
             Offsets with a gradient path to `means`, the box and the network; the planes' gradient goes to `grid.grads`.
         """
         (trunk,) = self.trunk(means, (time,), ops)
-        return Offsets.from_channels(self.heads(trunk, ops), self.cfg)
+        return Offsets.from_channels(self._heads(trunk, ops), self.cfg)
 
     def offsets_and_displacement(
         self, means: Tensor, time: float, other: float, ops: ModelOps
     ) -> tuple[Offsets, Tensor]:
         """`offsets` at `time`, and those of the centers alone, (N, 3) mm, at an `other` time: faster than two calls."""
         here, there = self.trunk(means, (time, other), ops)
-        return Offsets.from_channels(self.heads(here, ops), self.cfg), self.heads(there, ops, ("means",))["means"]
+        return Offsets.from_channels(self._heads(here, ops), self.cfg), self._heads(there, ops, ("means",))["means"]
+
+    def _heads(self, trunk: Tensor, ops: ModelOps, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
+        assert isinstance(self.heads, OffsetHeads)
+        return self.heads(trunk, ops, only)
 
     def trunk(self, means: Tensor, times: tuple[float, ...], ops: ModelOps) -> tuple[Tensor, ...]:
         """Output of the trunk on the features, (N, W) per time."""
@@ -204,10 +209,11 @@ class HexPlaneMotion(Motion):
         """See `Motion.planes`."""
         return cfg.deformation.hexplane
 
+    @override
     def offsets(
         self,
         gaussians: Gaussians,
-        field: HexPlaneField,
+        field: Field | None,
         time: float,
         cfg: Config,
         ops: ModelOps,
@@ -215,7 +221,7 @@ class HexPlaneMotion(Motion):
     ) -> Offsets:
         """See `Motion.offsets`."""
         means = gaussians["means"]
-        return field.offsets(means if chosen is None else means[chosen], time, ops)
+        return cast("HexPlaneField", field).offsets(means if chosen is None else means[chosen], time, ops)
 
 
 class LinearLayers:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..core.geometry import back_project, pixel_centers
 from .carry import carry_points
@@ -134,7 +134,7 @@ def neighborhoods(points: NDArray, samples: NDArray) -> tuple[NDArray[np.intp], 
         sample is no farther from it than its samples scatter.
     """
     k = min(NUM_NEIGHBORS, len(samples))
-    far, nearest = cKDTree(samples).query(points, k=k, workers=1)
+    far, nearest = KDTree(samples).query(points, k=k, workers=1)
     far, nearest = far.reshape(len(points), k), nearest.reshape(len(points), k)
     around = samples[nearest]
     scatter = np.sqrt(np.square(around - around.mean(1, keepdims=True)).sum(-1).mean(1))
@@ -154,11 +154,11 @@ def principal_stretches(before: NDArray, after: NDArray) -> NDArray[np.float64]:
         (..., 2) largest and smallest: length after over length before, along two perpendicular directions; NaN where a
         point is unknown, or all lie on a line.
     """
-    known = np.isfinite(before).all((-2, -1)) & np.isfinite(after).all((-2, -1))
+    known = np.asarray(np.isfinite(before).all((-2, -1)) & np.isfinite(after).all((-2, -1)))
     before, after = (np.where(known[..., None, None], points, 0.0) for points in (before, after))
     before, after = (points - points.mean(-2, keepdims=True) for points in (before, after))
     variances, axes = np.linalg.eigh(np.swapaxes(before, -1, -2) @ before)  # ascending: the normal comes first
-    known &= variances[..., 1] > THINNEST * variances[..., 2]
+    known = known & (variances[..., 1] > THINNEST * variances[..., 2])
     scale = np.where(known[..., None], variances[..., 1:], 1.0)
     gradient = np.swapaxes(after, -1, -2) @ (before @ axes[..., 1:]) / scale[..., None, :]
     return np.where(known[..., None], np.linalg.svd(gradient, compute_uv=False), np.nan)
@@ -219,7 +219,7 @@ class SurfaceMotion:
             (F, P) for each of `frames`; 1: unchanged. NaN for points that are not on the surface.
         """
         found = np.full((len(frames), len(points)), np.nan)
-        on_surface = np.isfinite(points).all(1)
+        on_surface = np.asarray(np.isfinite(points).all(1))
         if not len(self.samples) or not on_surface.any():
             return found
         nearest, around = neighborhoods(points[on_surface], self.samples)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import torch
@@ -110,7 +111,8 @@ def mixed(views: Sequence[tuple[RenderedView, float]]) -> RenderedView:
     if len(views) == 1:
         return views[0][0]
     names = [field.name for field in fields(RenderedView)]
-    return RenderedView(*(sum(weight * getattr(view, name) for view, weight in views) for name in names))
+    parts = ([weight * getattr(view, name) for view, weight in views] for name in names)
+    return RenderedView(*(reduce(torch.add, part) for part in parts))
 
 
 def faded(splats: Splats, weight: float) -> Splats:
