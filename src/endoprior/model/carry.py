@@ -29,10 +29,8 @@ for each px by which they disagree. Fitted to two phantoms (docs/log.md)."""
 class CarriedPoints:
     """P points at T times."""
 
-    positions: NDArray[np.float32]
-    """(T, P, 3) world, mm."""
-    confidence: NDArray[np.float32]
-    """(T, P) in [0, 1]: by `confidence_of`; greatest in the point's own frame, less in each window further on."""
+    positions: NDArray[np.float32]  # (T, P, 3) world, mm
+    confidence: NDArray[np.float32]  # (T, P) in [0, 1]; greatest in the point's own frame, less in each further window
 
 
 def carry_points(

@@ -28,27 +28,19 @@ THINNEST = 1e-3
 class Measures:
     """What is measured of `P` points, in each of `T` frames; NaN where unknown."""
 
-    since: int
-    """Frame that displacement and stretch refer to."""
-    distance: NDArray[np.float64]
-    """(T,) between the first two points; NaN for a single one."""
-    area: NDArray[np.float64]
-    """(T,) of the polygon of all points; NaN for fewer than three, and where its edges cross."""
-    path_length: NDArray[np.float64]
-    """(T, P) since frame 0, of the smoothed path."""
-    path_length_raw: NDArray[np.float64]
-    """(T, P) the same without smoothing: jitter counts."""
-    displacement: NDArray[np.float64]
-    """(T, P) distance from the position in frame `since`."""
-    stretch: NDArray[np.float64]
-    """(T, P) largest principal stretch of the surface around the point since frame `since`; 1: unchanged."""
+    since: int  # frame that displacement and stretch refer to
+    distance: NDArray[np.float64]  # (T,) between the first two points
+    area: NDArray[np.float64]  # (T,) of the polygon of all points; NaN where its edges cross
+    path_length: NDArray[np.float64]  # (T, P) since frame 0, of the smoothed path
+    path_length_raw: NDArray[np.float64]  # (T, P) without smoothing: jitter counts
+    displacement: NDArray[np.float64]  # (T, P) distance from the position in frame `since`
+    stretch: NDArray[np.float64]  # (T, P) largest principal stretch of the surface around the point; 1: unchanged
 
 
 def measures_of(paths: NDArray, stretch: NDArray, since: int, drawn: int) -> Measures:
-    """Every measure of carried points.
+    """Every measure of carried points: paths (T, P, 3), stretch (T, P).
 
     Args:
-        paths: (T, P, 3). stretch: (T, P).
         since: frame that displacement refers to. drawn: frame in which the polygon is cut into triangles.
     """
     paths = paths.astype(np.float64)
@@ -211,12 +203,9 @@ class SurfaceMotion:
         return frame / len(self._scene.cameras)
 
     def stretch(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """Largest principal stretch around points since the frame of the surface.
+        """(F, P) largest principal stretch, in each of `frames`, around points (P, 3), mm, of the surface's frame.
 
-        Args:
-            points: (P, 3) where they are in that frame, mm.
-        Returns:
-            (F, P) for each of `frames`; 1: unchanged. NaN for points that are not on the surface.
+        1: unchanged; NaN for points that are not on the surface.
         """
         found = np.full((len(frames), len(points)), np.nan)
         on_surface = np.asarray(np.isfinite(points).all(1))

@@ -34,12 +34,7 @@ class Playback:
     """
 
     def __init__(self, scene: Scene, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
-        """Start with an empty cache.
-
-        Args:
-            scene: what to play.
-            max_bytes: for all cached frames together; at least one frame is always cached.
-        """
+        """Args: max_bytes: for all cached frames together; at least one frame is always cached."""
         self.scene, self.max_bytes = scene, max_bytes
         self._kept: OrderedDict[int, list[tuple[Splats, float]]] = OrderedDict()
 
@@ -47,11 +42,7 @@ class Playback:
         return len(self.scene.cameras)
 
     def splats(self, index: int) -> Splats:
-        """The Gaussians of frame `index`, activated; see `Scene.at`.
-
-        Raises:
-            IndexError: no such frame.
-        """
+        """The Gaussians of frame `index`, activated; see `Scene.at`."""
         return joined([faded(splats, weight) for splats, weight in self._parts(index)])
 
     def _parts(self, index: int) -> list[tuple[Splats, float]]:
