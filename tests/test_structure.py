@@ -37,7 +37,7 @@ PRIVATE_WORDS = (
 PRIVATE_NAMES_ALLOWED = {"_C", "_hub_dir", "_asdict", "_fields", "_replace"}
 """What tests may use of gsplat, of torch.hub and of named tuples."""
 PRINTS = {
-    "system/console.py", "core/config_io.py", "cli/progress.py", "runs/progress.py",
+    "system/console.py", "core/former_config.py", "cli/progress.py", "runs/progress.py",
     "render/trial.py",
 }  # fmt: skip
 """The console; a module below it; lines that are replaced on a terminal; a trial, which prints its answer."""
