@@ -56,6 +56,7 @@ def test_missing_fields_keep_their_defaults():
         ({"temporal": {"gradient": "none"}}, "config.temporal.gradient"),
         ({"deformation": {"hexplane": {"multires": [1, "2"]}}}, "config.deformation.hexplane.multires[1]"),
         ({"init": {"budget": 0}}, "config.init"),
+        ({"windows": {"longest": 3}}, "config.windows"),
         ({"density": {"min_densify_weight": float("nan")}}, "config.density.min_densify_weight"),
         ({"density": {"min_densify_weight": 2}}, "config.density"),
         ([], "config"),

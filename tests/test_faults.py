@@ -16,7 +16,7 @@ from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.checkpoint import deferred_interrupt
+from endoprior.runs.folder import deferred_interrupt
 from endoprior.runs.train import train
 from endoprior.system import atomic
 from endoprior.system.atomic import CannotWrite, whole_file, whole_folder

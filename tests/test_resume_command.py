@@ -17,8 +17,8 @@ from endoprior.runs.folder import config_of_run, read_config
 
 QUICK = [
     "--preset", "paper", "--seed", "3", "--init-budget", "200", "--schedule.coarse-iterations", "2",
-    "--schedule.fine-iterations", "12", "--deformation.hexplane.resolution", "8", "8", "8",
-    "--deformation.hexplane.time-resolution", "6", "--no-networks",
+    "--schedule.fine-iterations", "12", "--deformation.hexplane.multires", "1",
+    "--deformation.hexplane.channels", "4", "--deformation.hexplane.time-resolution", "6", "--no-networks",
 ]  # fmt: skip
 
 

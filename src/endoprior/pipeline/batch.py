@@ -18,7 +18,7 @@ from ..evaluation.registry import all_scores
 from ..prepare.pipeline import Progress
 from ..render import ON_GPU
 from ..runs.remote import RESTARTS, Training, start_training_on, trainings
-from ..runs.training_run import WindowedRun
+from ..runs.train import WindowedRun
 from ..system.atomic import write_text
 from ..system.devices import Threads
 from ..system.ray_cluster import Cluster

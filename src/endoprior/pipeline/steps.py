@@ -30,8 +30,7 @@ from ..prepare.pipeline import Progress
 from ..runs.folder import CHECKPOINT, CONFIG
 from ..runs.log import mask_facts
 from ..runs.report import write_report
-from ..runs.train import start_run
-from ..runs.training_run import TrainingRun, WindowedRun
+from ..runs.train import TrainingRun, WindowedRun, start_run
 from ..system.atomic import write_json
 from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span

@@ -15,8 +15,7 @@ from .server import Viewer
 from .viewable_scene import ViewableScene
 
 if TYPE_CHECKING:
-    from ..training.stage import StepReport
-    from ..training.trainer import Trainer
+    from ..training.trainer import StepReport, Trainer
 
 REFRESH_SECONDS = 2.0
 """Least time between two displayed states."""
@@ -25,7 +24,7 @@ LARGEST_SHARE = 0.2
 
 
 class LiveView:
-    """An `on_step` callback of `runs.training_run.train` that updates a viewer at `host` and `port`."""
+    """An `on_step` callback of `runs.train.train` that updates a viewer at `host` and `port`."""
 
     def __init__(self, host: str, port: int) -> None:
         self.host, self.port = host, port

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from endoprior.system.arrays_file import ArraySpec, part
-from endoprior.training.stage import Stage
+from endoprior.training.trainer import Stage
 
 from .field import RadianceField
 
