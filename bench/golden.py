@@ -28,7 +28,6 @@ SHORT = (
     "--schedule.coarse-iterations", "40", "--schedule.fine-iterations", "260", "--init.budget", "2500",
     "--density.start-iteration", "40", "--density.every", "50", "--density.prior-threshold", "0.4",
     "--temporal.start-iteration", "60", "--temporal.min-points", "8", "--temporal.min-valid", "1",
-    "--loss.min-depth-pixels", "1",
 )  # fmt: skip
 CLOCK = ("fps", "fps_cached", "train_seconds", "iterations_per_second")
 

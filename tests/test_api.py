@@ -30,7 +30,7 @@ def test_readmes_python_block_runs_as_it_stands(tiny_sequence, tmp_path):
     checks = 'assert view.color.shape == (40, 48, 3) and "psnr" in scores and len(splats.means)\n'
     checks += "assert len(losses) == 3 and scene.config.optim.decay_iterations == 3000 and scene.config.seed == 1\n"
     script = tmp_path / "readme.py"
-    block = block.replace('"iterations": 3000', '"iterations": 3')
+    block = block.replace("iterations=3000", "iterations=3")
     script.write_text(SHORT + block.replace("DATA", str(tiny_sequence)).replace("RUN", str(tmp_path / "run")) + checks)
     done = subprocess.run([sys.executable, script], check=True, capture_output=True, text=True)
     assert not done.stdout and not done.stderr  # progress is for terminals and notebooks

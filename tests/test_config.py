@@ -16,7 +16,7 @@ from endoprior.core.config_deformation import BasisConfig, DeformationConfig, He
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.model.gaussians import motion_shape
 from endoprior.model.method import config_from
-from endoprior.model.presets import preset
+from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.folder import reject_other_run
 
@@ -116,6 +116,39 @@ def test_short_names_are_those_of_the_command_line():
     assert all(f"--{name}".replace("_", "-") in Train.short for name in config_io.SHORT_NAMES)
 
 
+def test_another_length_keeps_the_shares_of_the_schedule():
+    cfg, short = preset("default"), preset("default", iterations=500)
+    assert (short.schedule.fine_iterations, short.schedule.half_resolution_iterations) == (500, 167)
+    assert (short.density.start_iteration, short.temporal.start_iteration, short.density.stop_iteration) == (
+        167,
+        167,
+        5000,
+    )
+    assert short.optim.decay_iterations == 500 and short.density.every == cfg.density.every
+    assert cfg.replace({"iterations": "x2"}) == preset("default", iterations=3000)
+    assert short.replace({"iterations": 1}).schedule.half_resolution_iterations == 1  # 0 would mean never
+    assert preset("best", iterations=1500).optim.decay_iterations == 1500
+    mine = cfg.replace({"optim.decay_iterations": 900, "iterations": 500})
+    assert mine.optim.decay_iterations == 900  # what is named holds, in any order
+
+
+@pytest.mark.parametrize("name", sorted({*preset_names()} - {"default", "best", "preview"}))
+def test_a_published_schedule_changes_its_length_alone(name):
+    cfg = preset(name)
+    total = cfg.schedule.coarse_iterations + cfg.schedule.fine_iterations
+    short = preset(name, iterations=30)
+    assert cfg.schedule.literal and short.schedule.coarse_iterations + short.schedule.fine_iterations == 30
+    assert short.schedule.coarse_iterations == round(30 * cfg.schedule.coarse_iterations / total)
+    assert short.replace({"schedule.coarse_iterations": cfg.schedule.coarse_iterations,
+                          "schedule.fine_iterations": cfg.schedule.fine_iterations}) == cfg  # fmt: skip
+
+
+@pytest.mark.parametrize("wanted", [0, -3, 2.5, True, "many", None])
+def test_a_length_that_is_none_is_rejected(wanted):
+    with pytest.raises(InputError, match="iterations: expected a whole number above 0, got"):
+        preset("default", iterations=wanted)
+
+
 def test_a_field_goes_before_a_short_name_of_another():
     values = {"iterations": 1}
     config_io.override(values, {"iterations": 2}, "options of a plugin")
@@ -178,7 +211,7 @@ def test_what_the_version_before_stored_is_the_preset_of_today(name, told):
     assert len(dict(leaves(stored))) == 141
     assert config_from(stored) == config_from(stored) == preset(name)
     assert told() == (
-        "endoprior: stored config: 79 of its fields are constants of this version, with the same values\n"
+        "endoprior: stored config: 80 of its fields are constants of this version, with the same values\n"
     )
 
 

@@ -33,7 +33,7 @@ SMALL = planes((6, 5, 4), 7, 3, (1, 2))
 def tiny():
     """A config that trains in a second, with growth, pruning of nothing and a reset."""
     changes = {"density.start_iteration": 2, "density.every": 3, "density.grow_threshold": 1e-6}
-    cfg = preset("endogs", iterations=7, gaussians=200, **changes)
+    cfg = preset("endogs", gaussians=200, **{"schedule.fine_iterations": 7}, **changes)
     schedule = replace(cfg.schedule, coarse_iterations=4, sh_every=3)
     return replace(cfg, schedule=schedule, deformation=replace(cfg.deformation, hexplane=HexPlaneConfig(7, 3, (1,))))
 

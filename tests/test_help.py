@@ -13,6 +13,7 @@ from command_modules import parsed
 
 from endoprior.cli import descriptions, main
 from endoprior.cli.arguments import options
+from endoprior.cli.train import Train
 from endoprior.core.checks import InputError
 from endoprior.model.presets import preset
 
@@ -91,12 +92,12 @@ def test_optional_arguments_stand_in_brackets(command, usage, printed):
 def test_defaults_are_those_of_the_preset(printed):
     pages = [printed("train", "--preset", name, "--help") for name in ("default", "paper")]
     iterations = [re.search(r"--iterations INT .*\(default: (\d+)\)", page)[1] for page in pages]
-    assert iterations == ["1500", "3000"]
+    assert iterations == ["1500", "4000"]
     assert "--no-networks" in pages[0] and "Switch off: " in pages[0]
 
 
-def test_short_names_stand_for_config_fields():
-    config = parsed("train", "a", "b", "--iterations", "7", "--gaussians=300", "--seed", "4").config
+def test_short_names_and_the_length_change_the_config():
+    config = Train.from_words(["a", "b", "--iterations", "7", "--gaussians=300", "--seed", "4"]).config
     assert (config.schedule.fine_iterations, config.init.budget, config.seed) == (7, 300, 4)
     assert parsed("train", "a", "b", "--init_budget", "9").config.init.budget == 9
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..core.checks import input_error
+from ..core.shell import command
 from ..data import FrameSequence, load_sequence
 from ..evaluation.protocols.table import KEYS, SCORES, chosen_protocols
 from ..evaluation.registry import all_scores
@@ -94,7 +95,8 @@ class Eval(Command):
         growth = growth_of(run)
         result.scores |= dict(extra or {}) | ({"gaussians_growth": growth.ratio} if growth else {})
         result.protocol |= mask_facts(run)
-        self._finish(result, sequence, self.out or run, ". To see them: `endoprior render RUN` with the same --split")
+        see = command("render", run, "--split", self.split)
+        self._finish(result, sequence, self.out or run, f". To see them: `{see}`")
 
     def _score_pictures(self, folder: Path) -> None:
         """Score the rendered frames in `folder` on the sequence that takes the place of the run."""

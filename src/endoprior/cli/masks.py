@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ..core.checks import input_error, number_ranges
 from ..core.ranges import spread
+from ..core.shell import command
 from ..system.console import say
 from .arguments import Command
 from .progress import Counting
@@ -63,7 +64,7 @@ class Masks(Command):
             self._add_clicked(sequence)
         else:
             self._find_all(sequence)
-        say(f"look at {self.data / SHEET}; to correct masks: `endoprior view DATA`")
+        say(f"look at {self.data / SHEET}; to correct masks: `{command('view', self.data)}`")
 
     def _find_all(self, sequence: FrameSequence) -> None:
         """Find the tools of every frame, by our own means or by a segmenter that they prompt."""

@@ -6,6 +6,7 @@ import time as clock
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ..core.shell import command
 from ..data import load_sequence
 from ..model.presets import preset, preset_names
 from ..phantom import PhantomConfig
@@ -33,7 +34,7 @@ class Phantom(Command):
 
         write_phantom(self.out, self.config)
         say(f"{self.out}: {self.config.frames} frames of {self.config.width}x{self.config.height}")
-        say("next: `endoprior train DATA RUN` with this folder as DATA")
+        say(f"next: `{command('train', self.out, 'RUN')}`")
 
 
 @dataclass

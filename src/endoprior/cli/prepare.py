@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..core.checks import check_range, number_ranges
 from ..core.geometry import Convention
+from ..core.shell import command
 from ..prepare.config import PrepareConfig
 from ..system.console import say
 from .arguments import Command
@@ -52,7 +53,7 @@ class Prepare(Command):
             say(f"note: {note}")
         say(f"note: {done.out / RECORD} holds the path of your video; delete it before you share the folder")
         say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
-        say("next: `endoprior check DATA` and `endoprior train DATA RUN` with this folder as DATA")
+        say(f"next: `{command('check', done.out)}` and `{command('train', done.out, 'RUN')}`")
 
 
 @dataclass
@@ -96,7 +97,7 @@ class Poses(Command):
         if (self.data / TRUTH).exists():
             _say_errors(self.data / TRUTH, found)
         say(f"{self.data / POSES}: {len(found.camera_to_world)} poses")
-        say("next: `endoprior check DATA`")
+        say(f"next: `{command('check', self.data)}`")
 
 
 def _say_errors(truth: Path, found: FolderPath) -> None:

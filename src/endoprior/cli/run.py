@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.shell import command
 from ..model.presets import preset, preset_names
 from ..prepare.config import PrepareConfig
 from ..system.console import say
@@ -78,7 +79,7 @@ class Run(Command):
             say(f"  {what:<8}{path}")
         for line in filter(None, (problems(job), missed_tools_line(job.run, job.data))):
             say(line)
-        say("To turn and measure it: `endoprior view RUN` with the folder of the scene as RUN")
+        say(f"To turn and measure it: `{command('view', job.run)}`")
         if self.preview:
             say("For the whole model, run the same command without --preview and with another OUT.")
 

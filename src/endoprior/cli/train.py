@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 from ..core.checks import input_error
 from ..core.config import Config
 from ..core.config_io import SHORT_NAMES
+from ..core.shell import command
 from ..data import load_sequence
 from ..model.method import method_of
 from ..model.presets import preset, preset_names
@@ -35,6 +36,9 @@ class Train(Command):
     """Method: a preset of the config."""
     config_file: Path | None = field(default=None, metadata={"name": "config", "metavar": "FILE"})
     """Config of another run (config.json), or YAML with some fields. It overrides the preset; options override it."""
+    iterations: int = 0
+    """Length of the training. What begins and ends in between keeps its share of it; in
+    presets that follow a publication it keeps its number."""
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
@@ -69,10 +73,19 @@ class Train(Command):
         first = Parser(prog="endoprior train", add_help=False, allow_abbrev=False)  # so that --help shows their values
         first.add_argument("--preset", choices=preset_names())
         first.add_argument("--config", type=Path)
+        first.add_argument("--iterations", type=int)
         typed, _ = first.parse_known_args(argv)
         name, file = typed.preset or "default", typed.config
         cfg = preset(name) if file is None else read_config(file, preset(name))
-        args = parse(cls, argv, "train", preset=name, config=cfg)
+        if typed.iterations is not None:
+            cfg = cfg.replace({"iterations": typed.iterations})
+        args = parse(cls, argv, "train", preset=name, config=cfg, iterations=cfg.schedule.total)
+        if typed.iterations is not None and cfg.schedule.literal:
+            say(
+                "note: this preset follows a publication, so only the length changes; density control begins at "
+                f"iteration {cfg.density.start_iteration:,}, the temporal term at {cfg.temporal.start_iteration:,}, "
+                f"rates fall until {cfg.optim.decay_iterations:,}"
+            )
         if not args.resume:
             if args.out is None:
                 fix = "`endoprior train DATA RUN`."
@@ -137,7 +150,7 @@ class Train(Command):
             if line := missed_tools_line(out, self.data):
                 say(line)
         except KeyboardInterrupt:
-            say(f"Stopped; the trained scene is saved in {out}. To score it, run `endoprior eval RUN`.")
+            say(f"Stopped; the trained scene is saved in {out}. To score it: `{command('eval', out)}`.")
             raise
 
 

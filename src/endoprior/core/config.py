@@ -104,8 +104,6 @@ class LossConfig(Checked):
     cover_weight: Weight = 0.01
     """Weight of 1 - alpha where something hides the tissue: no holes open behind tools. Above 0, the total variation
     counts only where no tissue is visible; 0: over the whole frame."""
-    min_depth_pixels: Count = 10
-    """A frame with fewer pixels of measured tissue depth gets no depth loss."""
     track_weight: Weight = 0.02
     """Weight per mm of the distance to the tracks of `init.motion flow`: higher holds tissue closer to them; 0: off."""
     trust_masks: bool = False
@@ -195,6 +193,13 @@ class ScheduleConfig(Checked):
     """Fine iterations, from the first on, that use frames of half the width and height: more is faster, less sharp."""
     sh_every: Positive = 500
     """The degree in use rises by one each time this many iterations of a stage have passed."""
+    literal: bool = False
+    """The schedule is a published one: when `iterations` changes, the numbers of what begins and ends stay."""
+
+    @property
+    def total(self) -> int:
+        """Iterations of both stages."""
+        return self.coarse_iterations + self.fine_iterations
 
 
 @dataclass(frozen=True)
@@ -270,8 +275,9 @@ class Config(Checked):
         """This config with other values: `preset("default").replace({"iterations": 3000, "optim.means_lr": 2e-3})`.
 
         Args:
-            changes: new value by the field's dotted name (docs/config.md lists all) or short name: `iterations` is
-                `schedule.fine_iterations`, `gaussians` is `init.budget`.
+            changes: new value by the field's dotted name (docs/config.md lists all) or short name: `gaussians` is
+                `init.budget`; `iterations` is the length of the training, of which what begins and ends in between
+                keeps its share (`set_iterations`).
         Raises:
             InputError: no field has this name, or the value has the wrong type or range.
         """

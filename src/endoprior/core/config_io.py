@@ -16,13 +16,17 @@ from .checks import InputError, input_error, similar_name
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
 SHORT_NAMES = {
-    "iterations": "schedule.fine_iterations",
     "gaussians": "init.budget",
     "init_budget": "init.budget",
     "trust_masks": "loss.trust_masks",
     "eyes": "data.eyes",
 }
 """Short name of a config field -> its dotted name; in Python, in specs and, with dashes, on the command line."""
+IN_PROPORTION = (
+    "schedule.half_resolution_iterations", "schedule.sh_every", "density.start_iteration", "density.stop_iteration",
+    "temporal.start_iteration", "optim.decay_iterations",
+)  # fmt: skip
+"""What keeps its share of the training when `iterations` changes, unless `schedule.literal`."""
 FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
 
 
@@ -40,12 +44,16 @@ def override(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> 
 
     Args:
         changes: new value by name, such as `init.budget`, or `gaussians` (see `SHORT_NAMES`); a text such as "x0.75"
-            multiplies the number that is there.
+            multiplies the number that is there. `iterations` is the number of all iterations (`set_iterations`), and
+            is changed before the others.
         where: what the error message calls the changes.
     Raises:
         InputError: no field has this name; the message proposes the nearest one.
     """
-    for name, value in changes.items():
+    for name, value in sorted(changes.items(), key=lambda change: change[0] != "iterations"):
+        if name == "iterations" and name not in values and "schedule" in values:
+            set_iterations(values, value)
+            continue
         full = name if name in values else SHORT_NAMES.get(name, name)  # a plugin's options can have such a field
         *path, last = str(full).split(".")
         group: Any = values
@@ -53,12 +61,43 @@ def override(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> 
             group = group.get(part) if isinstance(group, dict) else None
         if not isinstance(group, dict) or last not in group or isinstance(group[last], dict):
             names = _dotted_names(values)
-            nearest = similar_name(str(name), [*(s for s, of in SHORT_NAMES.items() if of in names), *names])
+            short = [s for s, of in SHORT_NAMES.items() if of in names]
+            nearest = similar_name(str(name), ["iterations", *short, *names])
             fix = f"use `{nearest}`." if nearest else "see `endoprior train --help-all`."
             raise input_error(where, "the name of a config field", str(name), fix)
-        if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(group[last]) in (int, float):
-            value = type(group[last])(group[last] * float(factor[1]))
-        group[last] = value
+        group[last] = _multiplied(group[last], value)
+
+
+def set_iterations(values: dict[str, Any], wanted: Any) -> None:
+    """Make the training that long in a nested dict from `to_dict`: both stages together, each with its share.
+
+    Growth, the temporal term, full resolution and the decay of rates keep their places as shares of the length; those
+    of a literal schedule keep their numbers.
+
+    Args:
+        wanted: the number of all iterations, above 0, or a text such as "x0.5".
+    Raises:
+        InputError: it is no such number.
+    """
+    schedule = values["schedule"]
+    coarse, before = schedule["coarse_iterations"], schedule["coarse_iterations"] + schedule["fine_iterations"]
+    total = _multiplied(before, wanted)
+    if type(total) is not int or total < 1:
+        raise input_error("iterations", "a whole number above 0", f"{wanted!r}", "choose one.")
+    schedule["coarse_iterations"] = min(round(coarse * total / before), total - 1)
+    schedule["fine_iterations"] = total - schedule["coarse_iterations"]
+    if not schedule["literal"]:
+        for name in IN_PROPORTION:
+            group, _, field = name.partition(".")
+            least = min(values[group][field], 1)
+            values[group][field] = max(round(values[group][field] * total / before), least)
+
+
+def _multiplied(number: Any, value: Any) -> Any:
+    """The value, or the number times that of a text such as "x0.75"."""
+    if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(number) in (int, float):
+        return type(number)(number * float(factor[1]))
+    return value
 
 
 def _dotted_names(values: dict[str, Any], prefix: str = "") -> list[str]:

@@ -40,6 +40,7 @@ CONSTANTS: dict[str, Any] = {
     "deformation.basis.relative_width": 1.5,
     "deformation.basis.deform_color": True,
     "loss.depth_mode": "accumulated",
+    "loss.min_depth_pixels": 10,
     "temporal.displacement_weight": 1.0,
     "temporal.num_neighbors": 8,
     "temporal.huber_delta": 0.01,
@@ -99,6 +100,10 @@ def _moved(old: dict[str, Any]) -> dict[str, Any]:
         "temporal.without": (
             "temporal.pair_weights",
             "pair_weights" if not pairs else "distance" if distance == 0 else "nothing",
+        ),
+        "schedule.literal": (  # only presets after publications trained at full resolution throughout
+            "schedule.half_resolution_iterations",
+            old.get("schedule.half_resolution_iterations") == 0,
         ),
         "windows.longest": ("windows.enabled", old.get("windows.longest", 200) if old.get("windows.enabled") else 0),
     }

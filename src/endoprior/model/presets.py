@@ -17,7 +17,7 @@ def preset(name: str = "default", **changes: Any) -> Config:
     """The config of a preset: `preset("default", iterations=3000, seed=1)`.
 
     Args:
-        changes: other values, by names that `Config.replace` knows.
+        changes: other values, by names that `Config.replace` knows; `iterations` changes the whole schedule.
     Raises:
         InputError: no preset or field has this name, or a value has the wrong type or range.
     """
@@ -66,7 +66,12 @@ def paper() -> Config:
             base.optim, means_lr=1.6e-4, scales_lr=5e-3, quats_lr=1e-3, decay_iterations=4000, late_decay=1.0
         ),
         schedule=replace(
-            base.schedule, coarse_iterations=1000, fine_iterations=3000, half_resolution_iterations=0, sh_degree=3
+            base.schedule,
+            coarse_iterations=1000,
+            fine_iterations=3000,
+            half_resolution_iterations=0,
+            sh_degree=3,
+            literal=True,
         ),
         windows=replace(base.windows, longest=0),
     )

@@ -107,7 +107,6 @@ def shortened(cfg: Config) -> Config:
         schedule=replace(cfg.schedule, coarse_iterations=2, fine_iterations=8, half_resolution_iterations=1),
         density=replace(cfg.density, start_iteration=0, every=3, grow_threshold=1e-7),
         temporal=replace(cfg.temporal, start_iteration=2, min_points=8, min_valid=0),
-        loss=replace(cfg.loss, min_depth_pixels=1),
     )
 
 

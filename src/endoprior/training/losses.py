@@ -31,6 +31,8 @@ from .frames import TrainingFrame
 if TYPE_CHECKING:
     from .ops import TrainingOps
 
+MIN_DEPTH_PIXELS = 10  # a frame with fewer pixels of measured tissue depth gets no depth loss
+
 
 def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
     """L_rgb: mean absolute difference of (H, W, 3) colors over tissue pixels (H, W) and channels."""
@@ -108,7 +110,7 @@ def supervised_losses(
 
 def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, ops: TrainingOps) -> dict[str, Tensor]:
     """Weighted color, depth, total-variation and edge terms, and that of what is hidden, () each."""
-    depth_weight = cfg.depth_weight if frame.num_measured >= cfg.min_depth_pixels else 0.0
+    depth_weight = cfg.depth_weight if frame.num_measured >= MIN_DEPTH_PIXELS else 0.0
     fused = ops.supervised_losses(
         out.color,
         out.depth,
