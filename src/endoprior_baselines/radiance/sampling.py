@@ -1,10 +1,17 @@
-"""Where a ray is sampled: depths, or distances, in ascending order. Random numbers are passed in, never made here."""
+"""Where a ray is sampled, in ascending order, and what it shows: NeRF's alpha, NeuS's alpha, and the sum.
+
+Random numbers are passed in, never made here.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+LAST = 1e10
+"""Length of the interval behind the last sample: whatever is dense there is opaque."""
 FLOOR = 1e-5
 """Added to every weight, so that a ray without weights is sampled evenly."""
 
@@ -91,3 +98,58 @@ def weights_of(alpha: Tensor) -> Tensor:
     """(N, S) share of each sample in its ray: its alpha times what the samples before it let through."""
     through = torch.cumprod(1 - alpha + 1e-7, -1)
     return alpha * torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], -1)
+
+
+@dataclass(frozen=True)
+class Composited:
+    """What `N` rays show."""
+
+    color: Tensor
+    """(N, 3)."""
+    depth: Tensor
+    """(N,) sum of weight times depth, in the depth's unit; not divided by alpha."""
+    alpha: Tensor
+    """(N,) sum of weights."""
+    weights: Tensor
+    """(N, S)."""
+
+
+def composited(alpha: Tensor, color: Tensor, depth: Tensor) -> Composited:
+    """Blend samples front to back over black.
+
+    Args:
+        alpha: (N, S) in [0, 1]. color: (N, S, 3). depth: (N, S).
+    """
+    weights = weights_of(alpha)
+    return Composited((weights[..., None] * color).sum(1), (weights * depth).sum(1), weights.sum(1), weights)
+
+
+def density_alpha(density: Tensor, depth: Tensor) -> Tensor:
+    """1 - exp(-density x interval): NeRF's alpha.
+
+    Args:
+        density: (N, S) before the ReLU.
+        depth: (N, S) ascending.
+    """
+    last = torch.full_like(depth[:, :1], LAST)
+    return 1 - torch.exp(-torch.relu(density) * torch.cat([depth[:, 1:] - depth[:, :-1], last], -1))
+
+
+def surface_alpha(distance: Tensor, slope: Tensor, step: Tensor, sharpness: Tensor, anneal: float) -> Tensor:
+    """NeuS's alpha: how much of the logistic distribution around the surface a step takes in.
+
+    With the slope c of the distance along the ray, the distance is d - c step / 2 where the step begins and d + c step
+    / 2 where it ends; alpha = (S(begin) - S(end)) / S(begin), with S the sigmoid of sharpness times distance. At first
+    a surface that faces away counts half, so that gradients reach it: `anneal` goes from 0 to 1.
+
+    Args:
+        distance: (N, S) in the middle of each step.
+        slope: (N, S) change of the distance along the ray, -1 where it meets the surface head on.
+        step: (N, S). sharpness: ().
+    Returns:
+        (N, S) in [0, 1].
+    """
+    facing = -(torch.relu(0.5 - 0.5 * slope) * (1 - anneal) + torch.relu(-slope) * anneal)
+    enter = torch.sigmoid((distance - facing * step / 2) * sharpness)
+    leave = torch.sigmoid((distance + facing * step / 2) * sharpness)
+    return ((enter - leave + 1e-5) / (enter + 1e-5)).clamp(0, 1)
