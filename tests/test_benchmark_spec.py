@@ -13,9 +13,8 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data.scared import dataset_number
 from endoprior.model.presets import preset
-from endoprior_studies.ready_specs import find_spec, spec_names, specs_of
 from endoprior_studies.spec import Cell, MethodSpec, cells, sequence_folder
-from endoprior_studies.spec_file import load_spec, load_specs
+from endoprior_studies.spec_file import find_spec, load_spec, load_specs, spec_names, specs_of
 
 PLAIN = {
     "title": "two methods",

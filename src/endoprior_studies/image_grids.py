@@ -12,13 +12,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from endoprior.core.config import DataConfig
 from endoprior.core.geometry import length_unit, project
-from endoprior.core.types import Camera, Frame, RenderOutput
+from endoprior.core.types import Camera, Frame, RenderedView
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.model.scene import Scene
+from endoprior.model.scene import RenderedScene, Scene
 from endoprior.model.scene_file import load_scene
 from endoprior.priors import joint_texture_prior, specular_likelihood
 from endoprior.visualization.camera_paths import tissue_distance, turned
@@ -39,7 +40,7 @@ INSTABILITY_FULL_SCALE_MM = 1.0
 DIFFERENCE_FULL_SCALE_MM = 0.5
 
 
-def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
+def scenes_of(matrix: Matrix, sequence: str) -> dict[str, RenderedScene]:
     """The trained scene of every method that has one and whose cell is finished, by label."""
     spec = matrix.spec
     budget = spec.budgets[-1] if spec.budgets else None
@@ -49,16 +50,16 @@ def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
     return {spec.label(m): load_scene(run) for m, run in runs.items() if (run / "scene.safetensors").exists()}
 
 
-def _camera(scene: Scene, frame: Frame) -> Camera:
+def _camera(scene: RenderedScene, frame: Frame) -> Camera:
     """The camera of a frame, where the scene has it: its poses may have been estimated."""
     return replace(frame.camera, world_to_camera=scene.cameras[frame.index].world_to_camera)
 
 
-def _rendered(scene: Scene, frame: Frame) -> RenderOutput:
+def _rendered(scene: RenderedScene, frame: Frame) -> RenderedView:
     return scene.render(frame.time, _camera(scene, frame))
 
 
-def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def frames_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """The middle test frame, zoomed to a highlight, a dark part and a mask border; columns: input and each method."""
     test = sequence.frames("test")
     frame = test[len(test) // 2]
@@ -74,7 +75,7 @@ def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np
     return tile(tiles, len(columns))
 
 
-def sides_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def sides_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """The middle test frame, turned about the tissue; a row for each angle, a column for each method."""
     test = sequence.frames("test")
     frame, tiles = test[len(test) // 2], []
@@ -115,7 +116,7 @@ def _outlined(image: NDArray[np.uint8], windows: dict[str, tuple[slice, slice]])
     return outlined
 
 
-def instability_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def instability_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """Mean absolute change of rendered depth between adjacent frames, and each method's minus the first's."""
     frames, unit = list(sequence.frames("video")), length_unit(sequence.depth_is_relative)
     maps = {name: instability_map(scene, frames) for name, scene in scenes.items()}
@@ -132,7 +133,7 @@ def instability_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArr
     return tile(top + bottom, len(maps))
 
 
-def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
+def instability_map(scene: RenderedScene, frames: list[Frame]) -> NDArray[np.float64]:
     """(H, W) mean |change of depth|, mm, over adjacent pairs that both show rendered tissue; NaN where none does."""
     total = np.zeros(frames[0].tissue_mask.shape)
     count = np.zeros_like(total)
@@ -144,11 +145,11 @@ def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def prior_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def prior_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """The joint texture prior of the first frame, and the density of each method's projected centers there."""
     frame = sequence.frame(0)
     rho = joint_texture_prior(frame.rgb, frame.tissue_mask)
-    densities = {name: center_density(scene, frame) for name, scene in scenes.items()}
+    densities = {name: center_density(scene, frame) for name, scene in scenes.items() if isinstance(scene, Scene)}
     top = max(float(np.percentile(density, 99.5)) for density in densities.values())
     tiles = [_labeled(frame.rgb_u8, "input"), _labeled(colorize(rho, 0, 1), "prior")]
     tiles += [_labeled(colorize(d, 0, top), f"centers, {name}") for name, d in densities.items()]
@@ -163,15 +164,16 @@ def center_density(scene: Scene, frame: Frame) -> NDArray[np.float32]:
     column, row = pixels[seen].astype(int).T
     counts = np.zeros((height, width), np.float32)
     np.add.at(counts, (row, column), 1)
-    return cv2.GaussianBlur(counts, (0, 0), max(width / DENSITY_SIGMA, 1))
+    return np.asarray(cv2.GaussianBlur(counts, (0, 0), max(width / DENSITY_SIGMA, 1)), np.float32)
 
 
-def _labeled(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+def _labeled(image: MatLike, text: str) -> NDArray[np.uint8]:
     factor = -(-TILE_WIDTH_PX // image.shape[1])
-    return label(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST), text)
+    large = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    return label(np.asarray(large, np.uint8), text)
 
 
-GRIDS: dict[str, Callable[[FrameSequence, dict[str, Scene]], NDArray[np.uint8]]] = {
+GRIDS: dict[str, Callable[[FrameSequence, dict[str, RenderedScene]], NDArray[np.uint8]]] = {
     "frames": frames_grid,
     "sides": sides_grid,
     "instability": instability_grid,

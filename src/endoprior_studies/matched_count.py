@@ -89,10 +89,10 @@ def search_thresholds(
         A search per place; those with `value_of` share that of another method.
     """
     found: dict[Place, Search] = {}
-    probes = {place: Cell(*place, spec.seeds[0], spec.sequences[place[0]].folds[0]) for place in _places(spec)}
-    for place in probes:
+    matches = _matches(spec)
+    probes = {place: Cell(*place, spec.seeds[0], spec.sequences[place[0]].folds[0]) for place in matches}
+    for place, match in matches.items():
         sequence, method, budget = place
-        match = spec.methods[method].match
         if match.value_of:
             continue
         start = spec.config(method, sequence, budget, spec.seeds[0]).density.grow_threshold
@@ -108,11 +108,11 @@ def search_thresholds(
                 search.failure = result
                 continue
             search.tried.append((value, result))
-            if growth := spec.methods[place[1]].match.growth:
+            if growth := matches[place].growth:
                 search.target = growth * result.first
-    for place in probes:
-        if other := spec.methods[place[1]].match.value_of:
-            found[place] = found[place[0], other, place[2]]
+    for place, match in matches.items():
+        if match.value_of:
+            found[place] = found[place[0], match.value_of, place[2]]
     return found
 
 
@@ -120,18 +120,20 @@ def _next(search: Search) -> float | None:
     return None if search.failure else next_threshold(search)
 
 
-def _places(spec: Spec) -> list[Place]:
+def _matches(spec: Spec) -> dict[Place, MatchSpec]:
     budgets: Sequence[int | None] = spec.budgets or (None,)
-    return [(s, m, b) for s in spec.sequences for m, about in spec.methods.items() if about.match for b in budgets]
+    methods = {method: about.match for method, about in spec.methods.items() if about.match}
+    return {(s, m, b): match for s in spec.sequences for m, match in methods.items() for b in budgets}
 
 
 def matched_table(spec: Spec, searches: dict[Place, Search]) -> list[str]:
     """Lines of a Markdown table: what was wanted, and what was found."""
     titles = ("method", "sequence", "threshold of growth", "Gaussians", "wanted", "trainings")
     lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
+    matches = _matches(spec)
     for (sequence, method, budget), search in searches.items():
         name = spec.label(method) + (f", {budget:,}" if budget else "")
-        value, counted, wanted = _words(spec.methods[method].match, search)
+        value, counted, wanted = _words(matches[sequence, method, budget], search)
         lines.append(f"| {name} | {sequence} | {value} | {counted} | {wanted} | {len(search.tried)} |")
     return lines
 

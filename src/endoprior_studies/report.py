@@ -9,18 +9,17 @@ from typing import Any
 
 from endoprior.core.config_io import to_dict
 from endoprior.evaluation.registry import all_scores
+from endoprior.runs.log import growth_of
 from endoprior.system.atomic import write_json, write_text
 
 from .image_grids import GRIDS, write_image_grids
 from .matched_count import matched_table
 from .matrix import Matrix, commits_of, scores_of
 from .plots import budget_figure, curve_figure
-from .protocol_report import protocol_blocks, protocol_tables, protocol_values
 from .results import Results
-from .silent_rules import silent_rules
 from .spec import ClaimSpec, Spec
 from .statistics import Difference
-from .tables import csv_lines, latex, markdown, score_table
+from .tables import csv_lines, latex, markdown, protocol_blocks, protocol_tables, protocol_values, score_table
 
 SHOWN_NAMES = 6
 
@@ -197,6 +196,31 @@ def _silent(matrix: Matrix, mark: str) -> list[str]:
     return [f"{mark} Rules that never fired", "\n".join(f"- {line}." for line in lines)] if lines else []
 
 
+def silent_rules(matrix: Matrix) -> list[str]:
+    """A line for each method and sequence with a rule of density control that no Gaussian met in any cell.
+
+    What a table says of such a rule is an artifact.
+    """
+    spec, lines = matrix.spec, []
+    for sequence in spec.sequences:
+        for method in spec.methods:
+            folders = [f for cell, f in matrix.done.items() if (cell.sequence, cell.method) == (sequence, method)]
+            grown = [growth for folder in folders if (growth := growth_of(folder / "run"))]
+            changes = Counter[str]()
+            for growth in grown:
+                changes.update(growth.changes)
+            words = (
+                [] if changes["cloned"] + changes["split"] else ["nothing grew" if changes else "nothing grew or went"]
+            )
+            for name, count in changes.items():
+                if name.startswith("removed_") and not count:
+                    words.append(f"the rule {name.removeprefix('removed_')} removed nothing")
+            if grown and words:
+                events = sum(growth.num_events for growth in grown)
+                lines.append(f"{spec.label(method)}, {sequence}: {', '.join(words)} in {events} density events")
+    return lines
+
+
 def sentence(results: Results, claim: ClaimSpec) -> str:
     """The claim in words."""
     ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
@@ -210,7 +234,7 @@ def sentence(results: Results, claim: ClaimSpec) -> str:
 
 
 def _figures(matrix: Matrix, results: Results, folder: Path) -> None:
-    kinds = set(matrix.spec.figures)
+    kinds: set[str] = set(matrix.spec.figures)
     if not matrix.done:
         return
     if "budgets" in kinds:
