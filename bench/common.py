@@ -274,10 +274,3 @@ def report(measured: list[Row], options: argparse.Namespace, notes: dict[Row, st
     print(f"{threads()}\n{table(measured, notes)}")
     if options.json:
         save(measured, options.json)
-
-
-def main(measure: Measure, about: str | None) -> None:
-    """Command line of one stage: measure, print, write."""
-    options = arguments(about).parse_args()
-    set_threads(options.threads)
-    report(measure(sizes(options)), options)

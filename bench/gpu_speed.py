@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import common
-import rendering
 import scenes
 import torch
 from gpu_parity import Target
@@ -19,9 +18,10 @@ from endoprior import render
 from endoprior.core.types import Camera, Splats
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
+PRESETS = ("default", "paper")
 REPEATS, WARM_UP = 50, 5
 TIME = 0.4
 AT_A_TIME = 16
@@ -77,7 +77,7 @@ def speed(target: Target, sizes: tuple[common.Size, ...], repeats: int) -> list[
             "rendered from cached splats": partial(forward, rasterize, on_device),
             "rendered, with gradients": both_ways(rasterize, on_device),
         }
-        for name in rendering.PRESETS:
+        for name in PRESETS:
             steps[f"deformed ({name}) and rendered"] = deformed(rasterize, name, splats, camera, target.device)
         several = [on_device] * AT_A_TIME
         many = partial(render.load_many(target.backend), cameras=[camera] * AT_A_TIME, background=background)
@@ -126,14 +126,14 @@ def deformed(
     rasterize: Callable[..., Any], name: str, splats: Splats, camera: Camera, device: torch.device
 ) -> Callable[[], None]:
     """A preset's deformation at one time, then forward, on the device; the first call moves the scene there."""
-    kept: list[Scene] = []
+    kept: list[SingleScene] = []
 
     def step() -> None:
         if not kept:
             cfg, field = preset(name).fitted(68), None
             if cfg.deformation.kind == "hexplane":
                 field = HexPlaneField.from_points(splats.means, cfg.deformation, torch.Generator().manual_seed(0))
-            scene = rendering.make_scene(splats, camera, cfg, field and field.to(device))
+            scene = scenes.scene(splats, (camera,), cfg, field and field.to(device))
             kept.append(replace(scene, gaussians=scene.gaussians.to(device)))
         forward(rasterize, kept[0].at(TIME))
 

@@ -1,7 +1,5 @@
 """A whole training iteration of the presets `default` and `paper`, beside the same loop with plain torch inside.
 
-`python bench/iteration.py [--quick] [--json FILE]`
-
 The data is a phantom of a few frames. One and the same iteration is repeated: a fine one at full resolution, with all
 degrees of color, with the temporal term, without growth.
 """
@@ -121,7 +119,3 @@ def repeat(trainer: GaussianTrainer, iteration: int) -> StepReport:
     """Do a fine iteration again: the same frame, the same terms."""
     trainer.state.stage, trainer.state.iteration = Stage.FINE, iteration - 1
     return trainer.step()
-
-
-if __name__ == "__main__":
-    common.main(measure, __doc__)

@@ -1,7 +1,4 @@
-"""Every operation of model and training in Numba, beside the same operation in PyTorch.
-
-`python bench/ops.py [--quick] [--json FILE]`
-"""
+"""Every operation of model and training in Numba, beside the same operation in PyTorch."""
 
 from __future__ import annotations
 
@@ -142,7 +139,3 @@ def losses(width: int, height: int, ops: TrainingOps) -> common.Steps:
     mask = torch.rand(height, width, generator=generator) < 0.9
     given = (target, inverse, mask, mask, (1.0, 1.0, 0.03, 0.5))
     return {"": lambda _: torch.autograd.grad(ops.supervised_losses(color, depth, *given).sum(), (color, depth))}
-
-
-if __name__ == "__main__":
-    common.main(measure, __doc__)

@@ -15,23 +15,20 @@ import time
 from pathlib import Path
 from typing import Any
 
-import binning
 import common
-import compositing
 import iteration
 import ops
-import projection
 import rendering
 import stereo
 import viewer
 from common import Row
 
 STAGES: dict[str, common.Measure] = {
-    "projection": projection.measure,
-    "binning": binning.measure,
-    "compositing": compositing.measure,
+    "projection": rendering.projection,
+    "binning": rendering.binning,
+    "compositing": rendering.compositing,
     "ops": ops.measure,
-    "rendering": rendering.measure,
+    "rendering": rendering.rendering,
     "stereo": stereo.measure,
     "viewer": viewer.measure,
     "iteration": iteration.measure,

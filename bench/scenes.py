@@ -11,6 +11,8 @@ from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, Splats
 from endoprior.model.gaussians import Gaussians, motion_shape
+from endoprior.model.hexplane_field import HexPlaneField
+from endoprior.model.single_scene import SingleScene
 
 FOCAL_PER_WIDTH = 0.9
 """Of an endoscope; also the phantom's."""
@@ -60,6 +62,12 @@ def gaussians(drawn: Splats, cfg: Config) -> Gaussians:
     if cfg.deformation.kind == "basis":
         tensors["motion"] = torch.zeros(len(drawn), *motion_shape(cfg.deformation))
     return Gaussians({name: value.clone() for name, value in tensors.items()})
+
+
+def scene(drawn: Splats, cameras: tuple[Camera, ...], cfg: Config, field: HexPlaneField | None = None) -> SingleScene:
+    """A scene that shows `drawn`; without a field it stands still, but deforming costs the same as if it moved."""
+    nothing = torch.zeros(len(drawn))
+    return SingleScene(gaussians(drawn, cfg), field, cfg, cameras, 25.0, nothing, nothing)
 
 
 def sheet(num: int, seed: int = 0) -> Tensor:

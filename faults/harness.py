@@ -129,6 +129,13 @@ def small_sequence(folder: Path, frames: int = 24, width: int = 160, height: int
     return folder
 
 
+def training(data: Path, out: Path, iterations: int) -> list[object]:
+    """A short training, everything of the method in it."""
+    schedule = ("--schedule.coarse-iterations", 60, "--schedule.fine-iterations", iterations)
+    growth = ("--init-budget", 2000, "--density.start-iteration", 50, "--density.every", 50)
+    return ["train", data, out, "--no-networks", *schedule, *growth]
+
+
 def digest(file: Path) -> str:
     """SHA-256 of a file; of nothing if there is none."""
     return hashlib.sha256(file.read_bytes() if file.is_file() else b"").hexdigest()

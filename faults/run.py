@@ -15,18 +15,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import disk
 import drives
 import kills
 import limits
-import memory
+import shortage
 import soak
-import stops
 from corpus import CASES
 from harness import ENVIRONMENT, Row
 
 ROOT = Path(__file__).parents[1]
-BAD_INPUTS = str(ROOT / "tests" / "test_bad_inputs.py")
 BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
 
 
@@ -55,11 +52,11 @@ def inputs(work: Path) -> list[Row]:
 
 
 PARTS: dict[str, Callable[[Path], list[Row]]] = {
-    "kills": kills.main,
-    "disk": disk.main,
-    "stops": stops.main,
+    "kills": kills.kills,
+    "disk": shortage.disk,
+    "stops": kills.stops,
     "drives": drives.main,
-    "memory": memory.main,
+    "memory": shortage.memory,
     "inputs": inputs,
     "properties": properties,
     "soak": soak.main,
