@@ -21,12 +21,12 @@ from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.render import numba as numba_backend
-from endoprior.training import gaussian_method, temporal, temporal_numba
+from endoprior.training import gaussian_method, local_motion, temporal
 from endoprior.training import step as iteration_module
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer
-from endoprior.training.stage import Stage, StepReport
+from endoprior.training.trainer import Stage, StepReport
 
 PRESETS = ("default", "paper")
 FRAMES = 4
@@ -46,7 +46,10 @@ PARTS = {
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],
     "losses": [(gaussian_method, "supervised_terms")],
-    "temporal term": [(temporal, "choose"), *((temporal_numba, n) for n in ("neighbors", "affinity", "local_motion"))],
+    "temporal term": [
+        (temporal, "choose"),
+        *((local_motion, f"{n}_numba") for n in ("neighbors", "affinity", "local_motion")),
+    ],
     "compositing backward": [(numba_backend, "composite_backward"), (numba_backend, "gather")],
     "projection backward": [(numba_backend, "project_backward")],
     "other backward": [(torch.Tensor, "backward")],

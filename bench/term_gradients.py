@@ -27,7 +27,7 @@ from endoprior.data import load_sequence
 from endoprior.model.presets import preset
 from endoprior.training import losses
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.stage import Stage, stage_length
+from endoprior.training.trainer import Stage, stage_length
 
 AT = (0.25, 0.5, 0.75, 1.0)
 """Shares of the fine stage."""

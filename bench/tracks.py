@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.evaluation.predicted_tracks import PredictedTracks, TrueTracks, by_chained_flow, by_scene, true_tracks
+from endoprior.evaluation.scorers.tracks import PredictedTracks, TrueTracks, by_chained_flow, by_scene, true_tracks
 from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer

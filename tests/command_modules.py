@@ -1,10 +1,16 @@
-"""Where the arguments of a command are parsed."""
+"""The commands, as the tests of pages use them."""
 
-from endoprior.cli import COMMANDS, MODULES
+from endoprior.cli import REGISTRY
+from endoprior.cli.arguments import parse
 
 
-def module_of(name: str) -> str:
-    """The module of a command, or of `bench masks`."""
-    if name not in COMMANDS:
-        return {"bench": "endoprior_studies.bench", "bench masks": "endoprior_studies.tool_training.bench"}[name]
-    return f"endoprior.cli.{MODULES.get(name, name)}"
+def parsed(name: str, *words: str) -> object:
+    """The arguments of a command, or of `bench masks`; no file that they name is read."""
+    if name != "bench":
+        return parse(REGISTRY.load(name), words, name)
+    from endoprior_studies import bench
+    from endoprior_studies.tool_training import bench as masks
+
+    if words[:1] == ("masks",):
+        return parse(masks.BenchMasks, words[1:], "bench masks")
+    return parse(bench.Bench, words, "bench")

@@ -13,7 +13,7 @@ from endoprior.data import FrameSequence
 from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.runs.train import train
-from endoprior.training.stage import Stage
+from endoprior.training.trainer import Stage
 
 
 def trained_and_resumed(sequence: FrameSequence, cfg: Config, folder: Path, stop_at: int) -> SingleScene:

@@ -1,10 +1,5 @@
-"""Sample images with a painted border, for tests of the round border. As a program: what share of each kind is found.
+"""Sample images with a painted border, for tests of the round border."""
 
-PYTHONPATH=src python tests/painted_borders.py
-"""
-
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -238,16 +233,16 @@ NOT_ROUND = {
 }
 
 
-def judge(painted: Painted, find=find_circle, strips=find_strips) -> dict:
-    """Errors of the found circle in radii, pixels kept beyond the border (2 px of it are given), share of it lost."""
-    circle = find(painted.images)
+def judge(painted: Painted) -> dict:
+    """Errors of the found circle in radii, pixels kept beyond the border, share of it lost."""
+    circle = find_circle(painted.images)
     if not painted.circles or circle is None:
         return {"found": circle is not None}
     true = painted.circles
     x, y = np.mean([[c.center_x, c.center_y] for c in true], 0)
     error = max(np.hypot(circle.center_x - x, circle.center_y - y), abs(circle.radius - true[0].radius))
-    kept = circle.mask(WIDTH, HEIGHT, getattr(circle, "margin_px", 0.025 * circle.radius))
-    bars = strips(painted.images, circle) if strips is find_strips else strips(painted.images)
+    kept = circle.mask(WIDTH, HEIGHT, circle.margin_px)
+    bars = find_strips(painted.images, circle)
     kept[: bars.top] = kept[HEIGHT - bars.bottom :] = False
     kept[:, : bars.left] = kept[:, WIDTH - bars.right :] = False
     shows = np.logical_and.reduce([c.mask(WIDTH, HEIGHT) for c in true]) & painted.shows
@@ -257,22 +252,3 @@ def judge(painted: Painted, find=find_circle, strips=find_strips) -> dict:
         "beyond": int((kept & ~shows).sum()),
         "lost": 1 - (kept & shows).sum() / shows.sum(),
     }
-
-
-def main(kinds: Sequence[str] = (), seeds: int = 20) -> None:
-    """Print a table."""
-    for name, make in {**ROUND, **{f"no circle: {k}": v for k, v in NOT_ROUND.items()}}.items():
-        if kinds and name not in kinds:
-            continue
-        results = [judge(make(np.random.default_rng(seed))) for seed in range(seeds)]
-        found = [r for r in results if r["found"]]
-        line = f"{name:32} found {len(found):3}/{seeds}"
-        if found and "error" in found[0]:
-            good = sum(r["error"] <= 0.01 for r in found)
-            line += f"  within 1 % {good:3}  worst {max(r['error'] for r in found):.2%}"
-            line += f"  beyond {max(r['beyond'] for r in found):4} px  lost {np.mean([r['lost'] for r in found]):.1%}"
-        print(line, flush=True)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -6,6 +6,8 @@ import base64
 import json
 import re
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,6 +108,16 @@ def open_player(page: Page, address: Path) -> None:
     page.resize(640, round(520 + HEIGHT - stage_height))
     page.wait_for(f"picture.getBoundingClientRect().height == {HEIGHT}")
     settle(page)
+
+
+@contextmanager
+def with_script(page: Page, code: str) -> Iterator[None]:
+    """Run JavaScript before the scripts of each page that is loaded meanwhile."""
+    script = page.send("Page.addScriptToEvaluateOnNewDocument", source=code)["identifier"]
+    try:
+        yield
+    finally:
+        page.send("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
 
 
 def settle(page: Page, frame: int | None = None) -> None:

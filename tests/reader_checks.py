@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,12 @@ def assert_rejected(folder: Path, named: str, words: str, cfg: DataConfig | None
     assert path.endswith(named) and path.startswith(str(folder)), message
     assert words in message, message
     assert ", got " in rest and "\n" not in message and message.endswith(".") and rest.count(". ") >= 1, message
+
+
+def assert_damage_is_rejected(folder: Path, damage: Callable[[Path], object], named: str, words: str) -> None:
+    """As `assert_rejected`, once `damage` has changed the folder."""
+    damage(folder)
+    assert_rejected(folder, named, words)
 
 
 def remark_with(folder: Path, words: str, cfg: DataConfig | None = None) -> bool:

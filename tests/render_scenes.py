@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -127,3 +128,59 @@ def compare(backend, scene, view, image=2e-6, gradient=2e-5, **options):
     for name, value in want_grads.items():
         agree(grads[name], value, gradient, f"gradient of {name}")
     return want, want_grads
+
+
+def agree_where_full(backend, scene, view):
+    """Opaque layers: ALPHA_MAX binds, pixels stop, tiles are left early. Returns the reference's image.
+
+    Rounding of the transmittance can decide otherwise than float64 at a stop, hence the share that may differ.
+    """
+    want, want_grads = render_with_grads("reference", scene, view)
+    got, grads = render_with_grads(backend, scene, view)
+    off = ((got.color - want.color).abs().max(-1).values > 1e-5).float().mean()
+    assert off < 0.005, f"{off:.2%} of pixels differ"
+    for name in ("sh", "opacities", "means2d"):
+        gap = (grads[name] - want_grads[name]).norm() / want_grads[name].norm()
+        assert gap < 1e-3, f"gradient of {name} differs by {gap:.1e}"
+    return want
+
+
+def only_background(backend, num):
+    """`num` Gaussians, all behind the camera, show nothing and get no gradient."""
+    view = camera(33, 21)
+    scene = pick(splats(view), torch.arange(num))
+    scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
+    got, grads = render_with_grads(backend, scene, view, dtype=torch.float32)
+    assert (got.color == torch.tensor([0.1, 0.2, 0.3])).all() and not got.alpha.any() and not got.depth.any()
+    assert got.means2d.shape == (num, 2) and not got.radii.any()
+    assert all(not grads[name].any() for name in (*NAMES, "means2d")) and grads["background"].any()
+
+
+def rejects_other_types(module, monkeypatch):
+    """The module of a GPU backend, here on the CPU, wants float32 on one device of its type."""
+    view = camera(16, 9)
+    scene = splats(view, 3)
+    doubled = Splats(*(getattr(scene, name).double() for name in NAMES))
+    with pytest.raises(ValueError, match=r"float32 on one cpu device; got torch.float64"):
+        module.rasterize(doubled, view, background=torch.zeros(3).double())
+    with pytest.raises(ValueError, match=r"on one cpu device; got torch.float32 on .'cpu', 'meta'"):
+        module.rasterize(replace(scene, sh=scene.sh.to("meta")), view, background=torch.zeros(3))
+    monkeypatch.setattr(module, "DEVICE", "cuda")
+    with pytest.raises(ValueError, match=r"one cuda device; got torch.float32 on .'cpu'"):
+        module.rasterize(scene, view, background=torch.zeros(3))
+
+
+def asks_for_one_gradient(backend):
+    """A loss whose cotangents are expanded, most inputs frozen, one of them not contiguous."""
+    view = camera(23, 13)
+    scene = splats(view, 40, degree=1)
+    scene = replace(scene, sh=scene.sh.transpose(0, 1).contiguous().transpose(0, 1))
+    assert not scene.sh.is_contiguous()
+    found = {}
+    for name, dtype in (("reference", torch.float64), (backend, torch.float32)):
+        values = {field: getattr(scene, field).to(dtype) for field in NAMES}
+        values["opacities"].requires_grad_()
+        out = render.load(name)(Splats(**values), view, background=torch.zeros(3, dtype=dtype))
+        (out.alpha.sum() + out.color.sum()).backward()
+        found[name] = values["opacities"].grad
+    agree(found[backend], found["reference"], 1e-5, "gradient of opacities")

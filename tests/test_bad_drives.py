@@ -77,23 +77,23 @@ def test_a_drive_that_is_gone_is_one_line(tiny_sequence, monkeypatch, capsys, na
     def refuse(path, *words, **options):
         raise OSError(getattr(errno, name), os.strerror(getattr(errno, name)), *([str(path)] if is_named else []))
 
-    monkeypatch.setattr(Path, "iterdir", refuse)
-    assert main(["check", str(tiny_sequence)]) == 2
-    monkeypatch.undo()
-    monkeypatch.setattr(np, "fromfile", refuse)
-    assert main(["check", str(tiny_sequence)]) == 2
-    monkeypatch.undo()
-    monkeypatch.setattr("endoprior.cli.check.run", lambda argv: refuse(tiny_sequence))
-    assert main(["check", str(tiny_sequence)]) == 2
+    for place, change in (
+        ("pathlib.Path.iterdir", refuse),
+        ("numpy.fromfile", refuse),
+        ("endoprior.cli.check.Check.execute", lambda check: refuse(check.folder)),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(place, change)
+            assert main(["check", str(tiny_sequence)]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 3 and all(os.strerror(getattr(errno, name)) in line for line in lines)
 
 
 def test_a_bug_stays_a_traceback(monkeypatch):
-    def fail(argv):
+    def fail(check):
         raise OSError(errno.EBADF, "Bad file descriptor")
 
-    monkeypatch.setattr("endoprior.cli.check.run", fail)
+    monkeypatch.setattr("endoprior.cli.check.Check.execute", fail)
     with pytest.raises(OSError, match="Bad file"):
         main(["check", "data"])
 

@@ -111,18 +111,16 @@ def wrong_cases(cases: list[Case], samples: Samples, folder: Path, monkeypatch, 
     return wrong
 
 
-def named(names: tuple[str, ...]) -> list[Case]:
-    """Cases by their names."""
-    by_name = {case.name: case for case in CASES}
-    return [by_name[name] for name in names]
+BY_NAME = {case.name: case for case in CASES}
 
 
 def test_names_are_unique_and_there_are_many():
-    assert len({case.name for case in CASES}) == len(CASES) >= 400
+    assert len(BY_NAME) == len(CASES) >= 400
 
 
 def test_a_sample_of_bad_inputs_is_rejected_in_one_line(samples, tmp_path, monkeypatch, capfd):
-    assert not (wrong := wrong_cases(named(SAMPLE), samples, tmp_path, monkeypatch, capfd)), "\n".join(wrong)
+    wrong = wrong_cases([BY_NAME[name] for name in SAMPLE], samples, tmp_path, monkeypatch, capfd)
+    assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.slow
@@ -133,5 +131,6 @@ def test_bad_inputs_are_rejected_in_one_line_or_work(kind, samples, tmp_path, mo
 
 @pytest.mark.slow
 def test_processes_of_their_own_under_limits(samples, tmp_path, monkeypatch, capfd):
-    wrong = wrong_cases(named(AS_PROCESSES), samples, tmp_path, monkeypatch, capfd, run_as_process)
+    cases = [BY_NAME[name] for name in AS_PROCESSES]
+    wrong = wrong_cases(cases, samples, tmp_path, monkeypatch, capfd, run_as_process)
     assert not wrong, "\n".join(wrong)

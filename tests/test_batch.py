@@ -10,8 +10,9 @@ from ray_runs import silent
 from tiny_training import tiny_config
 
 from endoprior.cli import main
-from endoprior.cli.batch import entries_of, read_list
+from endoprior.cli.batch import entries_of
 from endoprior.core.checks import InputError
+from endoprior.model.presets import preset
 from endoprior.pipeline import Entry, SequenceJob, run_here, run_on, write_summary
 from endoprior.pipeline.steps import Step
 from endoprior.runs.remote import Trained, Training
@@ -113,13 +114,9 @@ def test_lines_of_a_list(tmp_path, make_tiny_sequence):
     data = make_tiny_sequence("a b")
     file = tmp_path / "list.txt"
     file.write_text(f"# all\n\n'{data}' --preset paper # one\nx2 = '{data}' --seed 3 --optim.means-lr=1e-3\n")
-    assert [(line.number, line.name, line.options) for line in read_list(file)] == [
-        (3, "a b", ("--preset", "paper")),
-        (4, "x2", ("--seed", "3", "--optim.means-lr=1e-3")),
-    ]
     first, second = entries_of(file, tmp_path / "out", silent)
-    assert first.job.out == tmp_path / "out/a b" and second.job.cfg.seed == 3 and second.job.cfg.optim.means_lr == 1e-3
-    assert (second.job.cfg.seed, second.job.cfg.optim.means_lr) == (3, 1e-3)
+    assert (first.name, first.job.out, first.job.cfg) == ("a b", tmp_path / "out/a b", preset("paper"))
+    assert (second.name, second.job.cfg.seed, second.job.cfg.optim.means_lr) == ("x2", 3, 1e-3)
     assert not (tmp_path / "out").exists()
 
 
@@ -129,10 +126,10 @@ def test_lines_of_a_list(tmp_path, make_tiny_sequence):
         (None, "expected a list of videos and sequence folders, got No such file"),
         ("# nothing\n", "expected a list of videos and sequence folders, got an empty file"),
         ("DATA\n\nabsent.mp4\n", "line 3: absent.mp4: expected a video or a sequence folder, got nothing"),
-        ("DATA\nDATA\n", "line 2: expected another name, got 'tiny' in line 1, too. Fix: `NAME = "),
-        ("../x = DATA\n", "line 1: expected a name for a folder"),
-        ("x =\n", "line 1: expected a path, got none"),
-        ("--seed 3\n", "line 1: expected a path, got --seed"),
+        ("DATA\nDATA\n", "line 2: NAME: expected another one, got 'tiny' in line 1, too. Fix: `NAME = "),
+        ("../x = DATA\n", "line 1: NAME: expected a name for a folder"),
+        ("x =\n", "line 1: PATH: expected a video or a folder, got none"),
+        ("--seed 3\n", "line 1: PATH: expected a video or a folder, got --seed"),
         ("'DATA\n", "line 1: expected words as in a shell, got No closing quotation"),
         ("DATA --resume\n", "line 1: --resume: expected options of what to train"),
         ("DATA --sed 3\n", "line 1: endoprior train"),

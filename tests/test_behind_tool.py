@@ -12,7 +12,7 @@ from endoprior.data import load_sequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext
 from endoprior.evaluation.scorers import other_views
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.visibility import shown_elsewhere
+from endoprior.phantom.views import shown_elsewhere
 
 FRAMES = 20
 

@@ -11,7 +11,7 @@ import pytest
 from endoprior.cli import main
 from endoprior.data.images import read_color
 from endoprior.phantom import PhantomConfig
-from endoprior.tool_masks import weights
+from endoprior.tool_masks import network as weights
 from endoprior_studies.tool_training import footage, leave_one_out
 from endoprior_studies.tool_training.benchmark import Counts, SetScore
 from endoprior_studies.tool_training.composites import IGNORED

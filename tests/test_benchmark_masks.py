@@ -15,9 +15,8 @@ from conftest import write_tiny_sequence
 from endoprior.cli import main
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.evaluation.mask_scores import SCORES
 from endoprior.evaluation.scoring import evaluate, scored_data
-from endoprior.evaluation.true_masks import TrueMasks, score_masks
+from endoprior.evaluation.true_masks import SCORES, TrueMasks, score_masks
 from endoprior.model.scene_file import load_scene
 from endoprior.tool_masks import FoundTools
 from endoprior_studies import changed_copy

@@ -17,7 +17,7 @@ from endoprior.core.geometry import camera_to_world
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.writer import SequenceMeta, new_sequence
 from endoprior.evaluation.scorers.camera_path import trajectory_errors
-from endoprior.prepare.camera_path import choose
+from endoprior.prepare.camera_path import sequence_path as choose
 from endoprior.tool_masks import FoundTools
 from endoprior_studies import changed_copy
 from endoprior_studies.matrix import run_matrix, scores_of

@@ -31,43 +31,27 @@ def as_json(path, **items):
     return path
 
 
+QUANTITIES = {"K_left": K1, "D_left": D1, "K_right": K2, "D_right": D2, "R": R, "T": T, "size": np.array([640, 512])}
 FORMS = {
-    "opencv yaml": lambda d: opencv_yaml(
-        d / "c.yaml", M1=K1, D1=D1, M2=K2, D2=D2, R=R, T=T, image_width=640, image_height=512
-    ),
-    "opencv yml": lambda d: opencv_yaml(
-        d / "c.yml",
-        cameraMatrix1=K1,
-        distCoeffs1=D1,
-        cameraMatrix2=K2,
-        distCoeffs2=D2,
-        R=R,
-        T=T,
-        imageSize=np.array([640, 512]),
-    ),
-    "json": lambda d: as_json(
-        d / "c.json", K_left=K1, distortion_left=D1, K_right=K2, distortion_right=D2, R=R, T_mm=T, width=640, height=512
-    ),
-    "npz": lambda d: (
-        np.savez(
-            d / "c.npz",
-            left_camera_matrix=K1,
-            left_dist_coeffs=D1,
-            right_camera_matrix=K2,
-            right_dist_coeffs=D2,
-            rotation=R,
-            translation=T,
-            resolution=[640, 512],
-        )
-        or d / "c.npz"
-    ),
-    "meters": lambda d: as_json(d / "c.json", K1=K1, dist1=D1, K2=K2, dist2=D2, R=R, T=T / 1000, width=640, height=512),
+    "c.yaml": "M1 D1 M2 D2 R T imageSize",
+    "c.yml": "cameraMatrix1 distCoeffs1 cameraMatrix2 distCoeffs2 R T image_size",
+    "c.json": "K_left distortion_left K_right distortion_right R T_mm size",
+    "c.npz": "left_camera_matrix left_dist_coeffs right_camera_matrix right_dist rotation translation resolution",
+    "m.json": "K1 dist1 K2 dist2 R T shape",
 }
+"""A name for each of the quantities; in the last file T is in m."""
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_every_file_format_gives_the_same_numbers(tmp_path, form):
-    found = read_calibration(FORMS[form](tmp_path))
+@pytest.mark.parametrize("name", FORMS)
+def test_every_file_format_gives_the_same_numbers(tmp_path, name):
+    path, items = tmp_path / name, dict(zip(FORMS[name].split(), QUANTITIES.values(), strict=True))
+    if name == "m.json":
+        items["T"] = T / 1000
+    if path.suffix == ".npz":
+        np.savez(path, **items)
+    else:
+        (as_json if path.suffix == ".json" else opencv_yaml)(path, **items)
+    found = read_calibration(path)
     half = np.zeros((3, 3))
     half[:2, 2] = 0.5  # OpenCV counts pixel centers from 0, we from 0.5
     assert np.allclose(found.left.matrix, K1 + half) and np.allclose(found.right.matrix, K2 + half)
@@ -85,12 +69,7 @@ def test_one_camera(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "bent",
-    [
-        {"distortion_coefficients": D1},
-        {"dist": D1},
-        dict(zip(("k1", "k2", "p1", "p2", "k3"), D1, strict=True)),
-    ],
+    "bent", [{"distortion_coefficients": D1}, {"dist": D1}, dict(zip(("k1", "k2", "p1", "p2", "k3"), D1, strict=True))]
 )
 def test_distortion_next_to_single_numbers(tmp_path, bent):
     path, numbers = tmp_path / "c.yaml", {"fx": 580, "fy": 582, "cx": 318.2, "cy": 255.1}
@@ -109,31 +88,24 @@ def test_the_unit_option(tmp_path):
         check_pair(read_calibration(path), "c.json")
 
 
+def pair(**items):
+    return json.dumps({"K1": K1.tolist(), "K2": K2.tolist()} | items)
+
+
+FORMATS = "a calibration of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci, or rows of numbers"
 BROKEN = {
-    "no suffix": (
-        "c",
-        "x",
-        "a calibration of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci, or rows of numbers",
-    ),
+    "no suffix": ("c", "x", FORMATS),
     "not json": ("c.json", "{", "a readable calibration"),
     "a list": ("c.json", "[1]", "rows of numbers, got a list"),
     "pickle in npz": ("c.npz", "x", "a readable calibration"),
     "python in yaml": ("c.yaml", "K_left: !!python/object/apply:os.system ['true']", "a readable calibration"),
     "no matrix": ("c.json", '{"R": 1}', "the left camera matrix"),
-    "no R": ("c.json", json.dumps({"K1": K1.tolist(), "K2": K2.tolist()}), "the relative pose of the cameras"),
-    "short T": (
-        "c.json",
-        json.dumps({"K1": K1.tolist(), "K2": K2.tolist(), "R": R.tolist(), "T": [1]}),
-        "t to have 3 numbers",
-    ),
+    "no R": ("c.json", pair(), "the relative pose of the cameras"),
+    "short T": ("c.json", pair(R=R.tolist(), T=[1]), "t to have 3 numbers"),
     "NaN": ("c.json", '{"K1": [[NaN,0,0],[0,1,0],[0,0,1]]}', "k of the only camera to be finite"),
-    "no rotation": (
-        "c.json",
-        json.dumps({"K1": K1.tolist(), "K2": K2.tolist(), "R": K1.tolist(), "T": [1, 2, 3]}),
-        "R to be a rotation",
-    ),
+    "no rotation": ("c.json", pair(R=K1.tolist(), T=[1, 2, 3]), "R to be a rotation"),
     "no focal length": ("c.json", '{"K1": [[0,0,0],[0,1,0],[0,0,1]]}', "a camera matrix"),
-    "coefficients": ("c.json", json.dumps({"K1": K1.tolist(), "D1": [0] * 7}), "distortion coefficients"),
+    "coefficients": ("c.json", pair(D1=[0] * 7), "distortion coefficients"),
     "ini without focal length": ("c.ini", "[StereoLeft]\nfc_x=1\n[StereoRight]\n", "fc_x, fc_y, cc_x, cc_y"),
     "size": ("c.json", json.dumps({"K1": K1.tolist(), "width": 0, "height": 3}), "width and height in px"),
 }

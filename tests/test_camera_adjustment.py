@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from relief import HEIGHT, WIDTH, lens, path, view
+from relief import lens, path, view
 
 from endoprior.prepare.camera_path.adjust import (
     Observations,
@@ -17,7 +17,6 @@ from endoprior.prepare.camera_path.adjust import (
 from endoprior.prepare.camera_path.colmap import ray_points
 from endoprior.prepare.camera_path.follow import follow_camera
 
-SIZE = (WIDTH, HEIGHT)
 OPENCV = lens().matrix
 
 

@@ -82,18 +82,18 @@ def test_an_erased_region_follows_too_and_the_rest_stays():
     assert done.before == "the first frame"
 
 
-def test_it_stops_at_a_cut():
-    before, true = moving_square([(50 + k, 40) for k in range(4)])
-    after = [texture(10 + k) for k in range(3)]
-    done = carried([*before, *after], [NO_MASK] * 7, 1, true[1])
-    assert list(done.masks) == [0, 2, 3] and done.after.startswith("frame 4: the motion is uncertain")
-
-
-def test_it_stops_where_the_color_changes_but_the_motion_does_not():
-    frames, true = moving_square([(50, 40)] * 4)
-    darker = [frame if k < 2 else (frame // 3) for k, frame in enumerate(frames)]
-    done = carried(darker, [NO_MASK] * 4, 0, true[0])
-    assert list(done.masks) == [1] and "color" in done.after and done.after.startswith("frame 2: ")
+@pytest.mark.parametrize(
+    ("step", "later", "stops"),
+    [
+        (1, lambda frame, k: texture(6 + k), "frame 4: the motion is uncertain"),
+        (0, lambda frame, k: frame // 3, "frame 4: the color of the region changed"),
+    ],
+    ids=["a cut", "another color"],
+)
+def test_it_stops_where_it_cannot_go_on(step, later, stops):
+    frames, true = moving_square([(50 + step * k, 40) for k in range(7)])
+    done = carried([frame if k < 4 else later(frame, k) for k, frame in enumerate(frames)], [NO_MASK] * 7, 1, true[1])
+    assert list(done.masks) == [0, 2, 3] and done.after.startswith(stops)
 
 
 def test_it_stops_when_the_region_leaves():

@@ -5,11 +5,18 @@ import pytest
 from tiny_sam2 import ColorSegmenter
 
 from endoprior.data import FrameSequence
-from endoprior.tool_masks import FoundTools, carry, prompts, video_segmenter
-from endoprior.tool_masks.carry import carry as carried
+from endoprior.tool_masks import FoundTools, video_segmenter
 from endoprior.tool_masks.mask_store import MaskStore
-from endoprior.tool_masks.prompts import Prompt, choose_prompts, rim_px, sure_regions, with_rim
-from endoprior.tool_masks.video_segmenter import segment_sequence
+from endoprior.tool_masks.video_segmenter import (
+    MOST_REGIONS,
+    Prompt,
+    carry,
+    choose_prompts,
+    rim_px,
+    segment_sequence,
+    sure_regions,
+    with_rim,
+)
 
 HEIGHT, WIDTH = 60, 80
 COLORS = {"a": (0, 0, 200), "b": (0, 200, 0)}
@@ -49,16 +56,16 @@ def test_sure_regions_lose_their_rim_and_come_largest_first():
     bridge = box(10, 10, 20, 20) | box(40, 10, 20, 20) | box(30, 20, 10, 2)
     assert len(sure_regions(bridge)) == 2, "a thin bridge does not make one object of two"
     many = np.any([box(10 * i, 10, 8, 8) for i in range(8)], axis=0)
-    assert len(sure_regions(many)) == prompts.MOST_REGIONS
+    assert len(sure_regions(many)) == MOST_REGIONS
     assert sure_regions(np.zeros_like(mask)) == []
 
 
 @pytest.mark.parametrize("order", [range(3, 12), range(11, 2, -1)])
 def test_chunks_see_the_first_frame_and_the_last_of_the_chunk_before(monkeypatch, order):
-    monkeypatch.setattr(carry, "CHUNK", 3)
+    monkeypatch.setattr(video_segmenter, "CHUNK", 3)
     frames = [image(i, a=(2 * i, 10, 10, 10)) for i in range(12)]
     segmenter, first = ColorSegmenter(), order[0]
-    found = dict(carried(segmenter, lambda i: frames[i], order, [box(2 * first, 10, 10, 10)]))
+    found = dict(carry(segmenter, lambda i: frames[i], order, [box(2 * first, 10, 10, 10)]))
     assert list(found) == list(order[1:])
     assert all((found[i] == box(2 * i, 10, 10, 10)).all() for i in found)
     chunks = [list(order[1:])[at : at + 3] for at in range(0, 8, 3)]
@@ -69,22 +76,22 @@ def test_chunks_see_the_first_frame_and_the_last_of_the_chunk_before(monkeypatch
 
 
 def test_frames_are_decoded_one_at_a_time(monkeypatch):
-    monkeypatch.setattr(carry, "CHUNK", 3)
+    monkeypatch.setattr(video_segmenter, "CHUNK", 3)
     asked = []
 
     def frame(i):
         asked.append(i)
         return image(i, a=(10, 10, 10, 10))
 
-    for _ in carried(ColorSegmenter(), frame, range(8), [box(10, 10, 10, 10)]):
+    for _ in carry(ColorSegmenter(), frame, range(8), [box(10, 10, 10, 10)]):
         pass
     assert asked == [0, 1, 2, 3, 0, 3, 4, 5, 6, 0, 6, 7]
 
 
 def test_a_carry_ends_where_all_objects_have_left(monkeypatch):
-    monkeypatch.setattr(carry, "PATIENCE", 2)
+    monkeypatch.setattr(video_segmenter, "PATIENCE", 2)
     frames = [image(i, **({"a": (10, 10, 9, 9)} if i in (0, 2) else {})) for i in range(9)]
-    found = [i for i, _ in carried(ColorSegmenter(), lambda i: frames[i], range(9), [box(10, 10, 9, 9)])]
+    found = [i for i, _ in carry(ColorSegmenter(), lambda i: frames[i], range(9), [box(10, 10, 9, 9)])]
     assert found == [1, 2, 3, 4], "one empty frame is waited for, two are not"
 
 
@@ -146,7 +153,6 @@ def test_a_tool_that_enters_between_prompted_frames_is_carried_in_a_second_round
 
 
 def test_stretches_have_prompts_of_their_own(monkeypatch, tmp_path):
-    monkeypatch.setattr(prompts, "STRETCH", 5)
     monkeypatch.setattr(video_segmenter, "choose_prompts", lambda scores: choose_prompts(scores, 5))
     images = [image(i, **{"a" if i < 6 else "b": TOOL}) for i in range(12)]
     sequence = clip(monkeypatch, images, {2: (box(*TOOL), 1.0), 8: (box(*TOOL), 1.0)})
@@ -168,16 +174,12 @@ def test_the_order_of_merging_does_not_matter(tmp_path):
         stores[0][4]
 
 
-def test_refining_keeps_the_given_masks(monkeypatch, tmp_path):
-    images = [image(i, a=TOOL) for i in range(3)]
-    sequence = clip(monkeypatch, images, {0: (box(*TOOL), 1.0)})
-    for mask, _ in segment_sequence(sequence, ColorSegmenter(), tmp_path, refine=True):
+def test_refining_keeps_the_given_masks_and_a_clip_without_tools_stays_empty(monkeypatch, tmp_path):
+    sequence = clip(monkeypatch, [image(i, a=TOOL) for i in range(3)], {0: (box(*TOOL), 1.0)})
+    for mask, _ in segment_sequence(sequence, ColorSegmenter(), tmp_path / "refined", refine=True):
         assert mask[52, 72] and mask[28, 28]
-
-
-def test_a_clip_without_tools_stays_empty(monkeypatch, tmp_path):
     segmenter = ColorSegmenter()
-    results = list(segment_sequence(clip(monkeypatch, [image(0), image(1)], {}), segmenter, tmp_path))
+    results = list(segment_sequence(clip(monkeypatch, [image(0), image(1)], {}), segmenter, tmp_path / "empty"))
     assert not any(mask.any() for mask, _ in results) and all(tools.confidence == 1 for _, tools in results)
     assert not segmenter.chunks
 

@@ -46,23 +46,14 @@ def test_overview_names_every_command(capsys):
     [
         (["trian"], "trian: expected one of run, demo, "),
         (["zzz"], "got no such command. Fix: `endoprior --help` explains each."),
-        (["train"], "required: DATA"),
         (["train", "nowhere", "out"], "nowhere"),
-        (["train", "nowhere", "out", "--sed", "1"], "--sed"),
         (["train", "nowhere", "out", "--preset", "finest"], "--preset"),
-        (["train", "nowhere", "out", "--seed", "one"], "one"),
-        (
-            ["train", "nowhere", "out", "--density.min-densify-weight", "2"],
-            "--density.min-densify-weight: min_densify_weight must be in",
-        ),
         (["train", "nowhere", "out", "--device", "cuda"], "--device"),
         (["train", "nowhere", "out", "--render.backend", "triton"], "a GPU that torch can use, got none here"),
         (["train", "nowhere", "out", "--render.backend", "gsplat", "--device", "cpu"], "--render.backend gsplat"),
-        (["eval", "nowhere", "--device", "gpu"], "gpu"),
         (["train", "nowhere", "out", "--weights-dir", "no-weights"], "no-weights"),
-        (["eval", "nowhere"], "nowhere"),
         (["eval", "nowhere", "--protocol", "nerf"], "got 'nerf'. Fix: See docs/scores.md."),
-        (["render", "nowhere"], "nowhere"),
+        (["render", "nowhere", "--times", "1.5"], "--times: expected times in [0, 1], got 1.5"),
         (["prior", "nowhere", "out"], "nowhere"),
         (["phantom", "out", "--frames", "1"], "frames"),
     ],
@@ -94,8 +85,8 @@ def test_eval_repeats_the_scores_of_train(run, tmp_path):
     _, folder = run
     assert main(["eval", str(folder), "--out", str(tmp_path), "--no-networks"]) == 0
     first, second = (json.loads((place / "metrics.json").read_text())["scores"] for place in (folder, tmp_path))
-    timed = {"fps", "fps_cached", "train_seconds", "iterations_per_second"}
-    assert {k: v for k, v in first.items() if k not in timed} == {k: v for k, v in second.items() if k not in timed}
+    timed = dict.fromkeys(("fps", "fps_cached", "train_seconds", "iterations_per_second"))
+    assert first | timed == second | timed
 
 
 @pytest.mark.parametrize("split", ["train", "video"])
@@ -119,15 +110,10 @@ def test_protocols_of_other_papers_stand_beside_our_scores(run, tmp_path):
     assert ours["split"] == "video, 17 frames" and theirs["split"] == "video, 16 without 0"
     assert ours["saw_test_frames"] == "yes: 15 of 17" and theirs["saw_test_frames"] == "yes: 14 of 16"
     assert ours["background"] == theirs["background"] == "black"
-    same = metrics["protocols"]["endogaussian"]["scores"]["psnr"]
-    assert (
-        same == pytest.approx(metrics["scores"]["psnr"], abs=1e-6) != metrics["protocols"]["endonerf"]["scores"]["psnr"]
-    )
-    stored = json.loads((folder / "metrics.json").read_text())
-    assert (
-        stored["protocol"]["tags"]["saw_test_frames"] == "no"
-        and stored["protocol"]["tags"]["split"] == "test, 2 frames"
-    )
+    same, other = (metrics["protocols"][name]["scores"]["psnr"] for name in ("endogaussian", "endonerf"))
+    assert same == pytest.approx(metrics["scores"]["psnr"], abs=1e-6) != other
+    stored = json.loads((folder / "metrics.json").read_text())["protocol"]["tags"]
+    assert (stored["saw_test_frames"], stored["split"]) == ("no", "test, 2 frames")
 
 
 def test_eval_of_other_data_is_an_error(run, make_tiny_sequence, capsys):
@@ -254,17 +240,15 @@ def test_prior_writes_maps_and_a_contact_sheet(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    "damage",
     [
-        (lambda file: file.write_bytes(b""), "scene.safetensors"),
-        (lambda file: file.write_bytes(file.read_bytes()[:-100]), "scene.safetensors"),
-        (lambda file: file.write_bytes(b"\xff" * 64), "scene.safetensors"),
-        (lambda file: file.unlink(), "scene.safetensors"),
+        lambda file: file.write_bytes(file.read_bytes()[:-100]),
+        lambda file: file.write_bytes(b""),
+        lambda file: file.unlink(),
     ],
 )
-def test_a_damaged_scene_is_named(run, tmp_path, capsys, damage, says):
-    _, folder = run
-    shutil.copytree(folder, tmp_path / "run")
+def test_a_damaged_scene_is_named(run, tmp_path, capsys, damage):
+    shutil.copytree(run[1], tmp_path / "run")
     damage(tmp_path / "run" / "scene.safetensors")
     assert main(["eval", str(tmp_path / "run")]) == 2
-    assert says in complaint(capsys)
+    assert "scene.safetensors" in complaint(capsys)

@@ -12,9 +12,16 @@ from endoprior.data import load_sequence
 from endoprior.data.found_tools import FrameRow, read_rows, write_rows
 from endoprior.data.images import read_tool_mask
 from endoprior.tool_masks.clicked_tools import ToolClick, find_clicked, parse_click
-from endoprior.tool_masks.examples import LARGEST_REGION, clicked_region, examples_of, fit
-from endoprior.tool_masks.feature_maps import SURE, feature_map
-from endoprior.tool_masks.logistic import fit_logistic, probability
+from endoprior.tool_masks.examples import (
+    LARGEST_REGION,
+    SURE,
+    clicked_region,
+    examples_of,
+    feature_map,
+    fit,
+    fit_logistic,
+    probability,
+)
 
 FRAMES, HEIGHT, WIDTH = 5, 96, 128
 TISSUE, GREEN, BLUE = (150, 70, 60), (60, 110, 70), (40, 60, 150)

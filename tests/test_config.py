@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from endoprior.cli.arguments import parse
-from endoprior.cli.train import HELP, Train
+from endoprior.cli.train import Train
 from endoprior.core import config_io, former_config
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
@@ -57,6 +56,7 @@ def test_missing_fields_keep_their_defaults():
         ({"temporal": {"gradient": "none"}}, "config.temporal.gradient"),
         ({"deformation": {"hexplane": {"multires": [1, "2"]}}}, "config.deformation.hexplane.multires[1]"),
         ({"init": {"budget": 0}}, "config.init"),
+        ({"windows": {"longest": 3}}, "config.windows"),
         ({"density": {"min_densify_weight": float("nan")}}, "config.density.min_densify_weight"),
         ({"density": {"min_densify_weight": 2}}, "config.density"),
         ([], "config"),
@@ -112,9 +112,8 @@ def test_short_names_are_those_of_the_command_line():
     cfg = preset("default").replace({"iterations": 7, "gaussians": "x0.5"})
     assert (cfg.schedule.fine_iterations, cfg.init.budget) == (7, 15_000)
     assert preset("default", iterations=7, gaussians=15_000) == cfg
-    words = ["--iterations", "7", "--gaussians", "15000", "d"]
-    assert parse(Train, words, "train", HELP, config=preset("default")).config == cfg
-    assert all(f"--{name}".replace("_", "-") in HELP.short for name in config_io.SHORT_NAMES)
+    assert Train.from_words(["--iterations", "7", "--gaussians", "15000", "d", "o"]).config == cfg
+    assert all(f"--{name}".replace("_", "-") in Train.short for name in config_io.SHORT_NAMES)
 
 
 def test_a_field_goes_before_a_short_name_of_another():

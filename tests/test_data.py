@@ -56,13 +56,6 @@ def test_frames_are_decoded_once_and_only_when_used(tiny_sequence):
         train[1]
 
 
-def test_validate_decodes_all(tiny_sequence):
-    seq = load_sequence(tiny_sequence)
-    assert seq.validate() == []
-    shutil.rmtree(tiny_sequence / "depth")
-    assert len(list(seq.frames("video"))) == 17
-
-
 @pytest.mark.parametrize(
     ("num_frames", "test"),
     [(2, [1]), (9, [1]), (10, [1, 9]), (63, [1, 9, 17, 25, 33, 41, 49, 57]), (156, list(range(1, 156, 8)))],
@@ -106,12 +99,6 @@ def test_intrinsics_without_description(tiny_sequence):
     assert seq.frame(0).depth.max() > 1000  # depth_scale 1: the stored hundredths of a millimeter as they stand
 
 
-def test_true_intrinsics_win(tiny_sequence):
-    describe(tiny_sequence, fx=60, fy=61.5, cx=20.25, cy=18)
-    camera = load_sequence(tiny_sequence).camera(0)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (60, 61.5, 20.25, 18)
-
-
 def test_poses_are_camera_to_world(tiny_sequence):
     rotation, center = rotation_about(1, 30) @ rotation_about(0, 10), np.array([3.0, -2, 7])
 
@@ -143,14 +130,6 @@ def test_opengl_poses_look_along_minus_z(tiny_sequence):
     np.testing.assert_allclose(camera.center, [1, 2, 3], atol=1e-12)
     pixel, z = project(camera.center - 10 * rotation[:, 2] + rotation[:, 1], camera)
     assert z == pytest.approx(10) and pixel[1] < 20  # y up in the pose, up in the image
-
-
-def test_inverted_polarity_by_description(tiny_sequence):
-    want = load_sequence(tiny_sequence).frame(0).tissue_mask
-    for file in (tiny_sequence / "masks").iterdir():
-        write(file, 255 - cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
-    describe(tiny_sequence, mask_tool_value=0)
-    np.testing.assert_array_equal(load_sequence(tiny_sequence).frame(0).tissue_mask, want)
 
 
 def test_gt_masks_only_by_option(tiny_sequence):
@@ -213,12 +192,6 @@ def test_legacy_lift_makes_missing_depth_near():
     depth, valid = clean_depth(raw, DataConfig(lift_missing_depth=True))
     assert valid.all()
     np.testing.assert_array_equal(depth[0, -2:], [4, 4])
-
-
-@pytest.mark.parametrize("lift", [False, True])
-def test_depth_missing_everywhere_stays_missing(lift):
-    depth, valid = clean_depth(np.full((3, 3), np.nan, np.float32), DataConfig(lift_missing_depth=lift))
-    assert not depth.any() and not valid.any()
 
 
 # --- fingerprint

@@ -11,13 +11,13 @@ from endoprior.core.types import Camera, Frame, RenderOutput
 from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.presets import preset
-from endoprior.training.adam import AdamState
-from endoprior.training.adam_numba import adam_step, adam_unstored_step
+from endoprior.training.adam import AdamState, adam_unstored_step
+from endoprior.training.adam import adam_step_numba as adam_step
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.stage import Stage
 from endoprior.training.step import Drawn
+from endoprior.training.trainer import Stage
 from endoprior_baselines.deform3dgs import METHOD, first_points
 from endoprior_baselines.learned_basis import COEFFICIENTS, value_at
 

@@ -12,7 +12,7 @@ from endoprior.core.config import ReleasedMethod
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.presets import preset
-from endoprior.training import density, density_numba
+from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan, apply_plan, split_children
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer, rate_of
@@ -50,7 +50,7 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
     stats = DensityStats.zeros(3)
     prior, mask = torch.full((20, 30), c), torch.ones(20, 30, dtype=torch.bool)
     for _ in range(5):
-        density_numba.add_score(stats, output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
+        NUMBA.add_score(stats, output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
     # epsilon 1e-6 in the denominator of Eq. (7)
     assert stats.score(0.0).tolist() == pytest.approx([c] * 3, abs=1e-6)
     assert stats.mean_opacity(torch.zeros(3)).tolist() == pytest.approx([0.4] * 3)
@@ -59,7 +59,7 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
 def test_score_samples_a_ramp_at_the_projected_centre():
     ramp = (torch.arange(30) + 0.5).expand(20, 30) / 30  # value x / 30 at x px
     stats = DensityStats.zeros(2)
-    density_numba.add_score(
+    NUMBA.add_score(
         stats,
         output([[7.25, 3.0], [20.5, 12.0]]),
         ramp.contiguous(),
@@ -74,7 +74,7 @@ def test_projections_off_the_image_off_tissue_or_undrawn_do_not_count():
     mask[:, :10] = False
     stats = DensityStats.zeros(5)
     where = [[-1, 5], [15, 25], [4, 4], [20, 10], [20, 10]]
-    density_numba.add_score(stats, output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))
+    NUMBA.add_score(stats, output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))
     assert stats.num_valid.tolist() == [0, 0, 0, 0, 1]
 
 
@@ -89,7 +89,7 @@ def test_score_agrees_with_grid_sample(scale):
     prior, mask = torch.rand(20, 30, generator=generator), torch.rand(20, 30, generator=generator) > 0.3
     opacities = torch.rand(num, generator=generator)
     stats = DensityStats.zeros(num)
-    density_numba.add_score(stats, output(means2d.tolist(), radii.tolist()), prior, mask, opacities, scale)
+    NUMBA.add_score(stats, output(means2d.tolist(), radii.tolist()), prior, mask, opacities, scale)
 
     grid = (2 * scale * means2d / torch.tensor([30.0, 20.0]) - 1)[None, None]
     maps = torch.stack([prior, mask.float()])[None]
@@ -101,56 +101,56 @@ def test_score_agrees_with_grid_sample(scale):
     assert torch.equal(stats.num_valid[clear], valid.float()[clear])
     torch.testing.assert_close(stats.score_sum[clear], torch.where(valid, value, 0)[clear], rtol=1e-5, atol=1e-5)
     assert torch.equal(stats.opacity_sum[clear], torch.where(valid, opacities, 0)[clear])
-    found = density_numba.valid_projection(scale * means2d, radii, mask)
+    found = NUMBA.valid_projection(scale * means2d, radii, mask)
     assert torch.equal(found, stats.num_valid > 0)
 
 
-@pytest.mark.parametrize("unobserved", [0.0, 1.0])
-def test_unobserved_gaussians_get_the_configured_score(unobserved):
-    assert DensityStats.zeros(2).score(unobserved).tolist() == [unobserved] * 2
-
-
 @pytest.mark.parametrize(("unobserved", "factor"), [(0.0, 0.35), (1.0, 1.0)])
-def test_factor_of_an_unobserved_gaussian(unobserved, factor):
-    weight = density.densify_weight(DensityStats.zeros(1).score(unobserved), CFG)
-    assert weight.item() == pytest.approx(factor)
+def test_score_and_factor_of_an_unobserved_gaussian(unobserved, factor):
+    score = DensityStats.zeros(2).score(unobserved)
+    assert score.tolist() == [unobserved] * 2
+    assert density.densify_weight(score, CFG).tolist() == pytest.approx([factor] * 2)
 
 
 def test_gradient_is_counted_in_ndc_and_only_where_drawn():
     out = output([[1, 1], [2, 2]], [1, 0])
     out.means2d.grad = torch.tensor([[3.0, 4.0], [1.0, 1.0]])
     stats = DensityStats.zeros(2)
-    density_numba.add_gradient(stats, out, width=200, height=100)
+    NUMBA.add_gradient(stats, out, width=200, height=100)
     assert stats.grad2d_ndc_sum.tolist() == pytest.approx([np.hypot(300, 200), 0])
     assert stats.num_seen.tolist() == [1, 0]
 
 
-def test_nothing_is_cloned_at_extent_zero():
-    stats = stats_of(4, gradient=1.0, score=1.0, num_valid=1)
-    scales = torch.full((4, 3), 1e-3)
-    planned = density.plan(stats, scales, torch.full((4,), 0.5), 0.0, CFG)
-    assert planned.split.all() and not planned.clone.any() and not planned.remove.any()
+GROWING = {"gradient": 1.0, "score": 1.0, "num_valid": 1}
+LIMITED = ReleasedMethod(prune_max_scale_mm=40.0)
 
 
-def test_small_gaussians_are_cloned_in_a_large_scene():
-    stats = stats_of(2, gradient=1.0, score=1.0, num_valid=1)
-    scales = torch.tensor([[0.5, 0.1, 0.1], [5.0, 0.1, 0.1]])
-    planned = density.plan(stats, scales, torch.full((2,), 0.5), 100.0, CFG)
-    assert planned.clone.tolist() == [True, False] and planned.split.tolist() == [False, True]
+@pytest.mark.parametrize(
+    ("largest", "opacities", "extent", "released", "known", "does"),
+    [
+        ([1e-3] * 3, 0.5, 0.0, None, GROWING, "sss"),  # nothing is cloned at extent zero
+        ([0.5, 5.0], 0.5, 100.0, None, GROWING, "cs"),  # small ones are cloned in a large scene
+        ([1.0, 41.0, 1.0], [0.004, 0.5, 0.5], 0.0, LIMITED, {}, "rr."),  # faint and huge ones go
+        ([50.0, 70.0], 0.5, 0.0, LIMITED, GROWING, "sr"),  # the children of the first one fit
+        ([1.0, 1.0], 0.5, 0.0, None, {"gradient": [4e-4, 6e-4], "score": 0.0, "num_valid": 5}, ".s"),  # 0.35 x 6e-4
+        ([1.0, 1.0], 0.5, 0.0, None, {"gradient": [1.9e-4, 2.1e-4], "score": 1.0, "num_valid": 10**6}, ".s"),
+    ],
+)
+def test_what_a_plan_does_to_each(largest, opacities, extent, released, known, does):
+    """`c` clone, `s` split, `r` remove; the longest axis of each Gaussian is given."""
+    num = len(largest)
+    known = known | {"gradient": torch.tensor(known.get("gradient", 0.0))}
+    scales = torch.tensor(largest)[:, None] * torch.tensor([1.0, 0.2, 0.2])
+    planned = density.plan(stats_of(num, **known), scales, torch.tensor(opacities).expand(num), extent, CFG, released)
+    for letter, rows in (("c", planned.clone), ("s", planned.split), ("r", planned.remove)):
+        assert rows.tolist() == [each == letter for each in does], letter
 
 
-@pytest.mark.parametrize("cfg", [replace(CFG, min_densify_weight=1.0), CFG])
-def test_score_one_or_floor_one_is_plain_growth(cfg):
-    gradient = torch.tensor([1.9e-4, 2.1e-4])
-    stats = stats_of(2, gradient=gradient, score=1.0, num_valid=10**6)
+def test_a_floor_of_one_is_plain_growth():
+    stats = stats_of(2, gradient=torch.tensor([1.9e-4, 2.1e-4]), score=0.0, num_valid=10**6)
+    cfg = replace(CFG, min_densify_weight=1.0)
     planned = density.plan(stats, torch.ones(2, 3), torch.full((2,), 0.5), 0.0, cfg)
     assert planned.split.tolist() == [False, True]
-
-
-def test_a_low_score_raises_the_bar():
-    stats = stats_of(2, gradient=torch.tensor([4e-4, 6e-4]), score=0.0, num_valid=5)
-    planned = density.plan(stats, torch.ones(2, 3), torch.full((2,), 0.5), 0.0, CFG)
-    assert planned.split.tolist() == [False, True]  # 0.35 x 6e-4 > 2e-4 > 0.35 x 4e-4
 
 
 @pytest.mark.parametrize(
@@ -159,24 +159,8 @@ def test_a_low_score_raises_the_bar():
 )
 def test_prior_prune_needs_all_three(num_valid, score, opacity, gone):
     stats = stats_of(1, score=score, num_valid=num_valid, opacity=opacity)
-    planned = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, CFG)
-    assert planned.remove.item() is gone
-    off = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, replace(CFG, min_densify_weight=1.0))
-    assert not off.remove.item()
-
-
-def test_faint_and_huge_gaussians_go():
-    released = ReleasedMethod(prune_max_scale_mm=40.0)
-    scales = torch.tensor([[1.0] * 3, [41.0] * 3, [1.0] * 3])
-    planned = density.plan(stats_of(3), scales, torch.tensor([0.004, 0.5, 0.5]), 0.0, CFG, released)
-    assert planned.remove.tolist() == [True, True, False]
-
-
-def test_a_huge_gaussian_whose_children_fit_is_split():
-    released = ReleasedMethod(prune_max_scale_mm=40.0)
-    stats = stats_of(2, gradient=1.0, score=1.0, num_valid=1)
-    planned = density.plan(stats, torch.tensor([[50.0] * 3, [70.0] * 3]), torch.full((2,), 0.5), 0.0, CFG, released)
-    assert planned.split.tolist() == [True, False] and planned.remove.tolist() == [False, True]
+    for cfg, goes in ((CFG, gone), (replace(CFG, min_densify_weight=1.0), False)):
+        assert density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, cfg).remove.item() is goes
 
 
 def test_growth_stops_at_the_guard(monkeypatch):

@@ -244,7 +244,7 @@ def test_a_folder_prepared_without_depth_opens_and_check_says_how_to_add_it(tmp_
     poses[:, 0, 3] = np.arange(12)
     np.save(tmp_path / "poses.npy", poses)
     said = prepare(tmp_path, capsys, "--depth", "none", "--poses", str(tmp_path / "poses.npy"))
-    assert f"next: endoprior check {tmp_path / 'out'}" in said
+    assert "next: `endoprior check DATA`" in said
     sequence = load_sequence(tmp_path / "out")
     assert len(sequence) == 12 and sequence.camera(5).world_to_camera[0, 3] == -5
     assert sequence.camera(0).fx == pytest.approx(32 / np.tan(np.radians(35)))

@@ -1,5 +1,6 @@
 """The depth network: a tiny one with random weights stands for the real one; nothing is downloaded."""
 
+import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,9 +10,8 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.evaluation.networks import import_torchvision
-from endoprior.prepare import relative_depth
-from endoprior.prepare.hub_model import FILES
-from endoprior.prepare.relative_depth import DepthNetwork
+from endoprior.prepare import networks
+from endoprior.prepare.networks import FILES, DepthNetwork
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.
@@ -28,22 +28,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     backbone = Dinov2Config(
-        hidden_size=16,
-        num_hidden_layers=4,
-        num_attention_heads=2,
-        image_size=56,
-        patch_size=14,
-        out_indices=[1, 2, 3, 4],
-        reshape_hidden_states=False,
-    )
-    config = DepthAnythingConfig(
-        backbone_config=backbone,
-        patch_size=14,
-        reassemble_hidden_size=16,
-        neck_hidden_sizes=[8, 8, 8, 8],
-        fusion_hidden_size=8,
-        head_hidden_size=8,
-    )
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
+        out_indices=[1, 2, 3, 4], reshape_hidden_states=False,
+    )  # fmt: skip
+    sizes = {"neck_hidden_sizes": [8, 8, 8, 8], "fusion_hidden_size": 8, "head_hidden_size": 8}
+    config = DepthAnythingConfig(backbone_config=backbone, patch_size=14, reassemble_hidden_size=16, **sizes)
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = DepthAnythingForDepthEstimation(config)
@@ -56,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @needs_transformers
 def test_a_model_folder_runs_on_any_image_size(folder, monkeypatch):
-    monkeypatch.setattr(relative_depth, "SHORT_SIDE_PX", 56)
+    monkeypatch.setattr(networks, "SHORT_SIDE_PX", 56)
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
     network = DepthNetwork(folder)
     image = np.random.default_rng(0).integers(0, 256, (45, 71, 3), np.uint8)
@@ -126,10 +115,8 @@ def test_a_package_that_transformers_lacks_is_one_line(folder, monkeypatch):
 
 
 def test_importing_the_module_loads_neither_torch_nor_transformers():
-    import subprocess
-
     code = (
-        "import sys, endoprior.prepare.relative_depth, endoprior.prepare.sam2, endoprior.prepare.pipeline; "
+        "import sys, endoprior.prepare.pipeline; "
         "assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -18,8 +18,8 @@ from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
-from endoprior.training.stage import Stage
 from endoprior.training.step import Drawn
+from endoprior.training.trainer import Stage
 from endoprior_baselines.endo4dgs import (
     METHOD,
     SmallField,

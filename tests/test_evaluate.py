@@ -11,8 +11,7 @@ from endoprior.cli import main
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks
 from endoprior.evaluation.context import Evaluation
-from endoprior.evaluation.predicted_tracks import by_scene, true_tracks
-from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, track_scores
+from endoprior.evaluation.scorers.tracks import by_scene, parts_of, track_end_error_mm, track_scores, true_tracks
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.carry import carry_points
 from endoprior.model.presets import preset
@@ -76,7 +75,7 @@ def test_a_point_of_the_scene_is_hidden_under_the_tool_mask_or_behind_tissue(pha
     assert shown.visible.mean() > 0.05  # few untrained Gaussians leave holes
     starts = true.at_start(true.points)
     monkeypatch.setattr(
-        "endoprior.evaluation.predicted_tracks.carry_points", lambda *_: np.tile(1.2 * starts, (10, 1, 1))
+        "endoprior.evaluation.scorers.tracks.carry_points", lambda *_: np.tile(1.2 * starts, (10, 1, 1))
     )
     assert by_scene(scene, true, phantom).visible.mean() < 0.01, "a fifth deeper than the tissue"
 
@@ -97,9 +96,7 @@ def test_unpaired_points_are_held_against_the_nearest_end(phantom, monkeypatch):
 def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
     cfg = preset("default")
     cfg = replace(
-        cfg,
-        init=replace(cfg.init, budget=400),
-        schedule=replace(cfg.schedule, coarse_iterations=0, fine_iterations=5),
+        cfg, init=replace(cfg.init, budget=400), schedule=replace(cfg.schedule, coarse_iterations=0, fine_iterations=5)
     )
     names = {
         "psnr_behind_tool",
@@ -129,7 +126,7 @@ def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
         schedule=replace(quick.schedule, coarse_iterations=0, fine_iterations=10, half_resolution_iterations=0),
     )
     monkeypatch.setattr(package, "write_phantom", small)
-    monkeypatch.setattr("endoprior.cli.demo.preset", lambda name: quick)
+    monkeypatch.setattr("endoprior.cli.phantom.preset", lambda name: quick)
     assert main(["demo", str(tmp_path / "demo"), "--frames", "10"]) == 0
     for part in (
         "report.png",

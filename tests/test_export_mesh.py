@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import trimesh
 from export_scenes import moving_scene, plane_camera
-from plyfile import PlyData
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
@@ -142,12 +141,6 @@ def test_mesh_files_read_back(kind, triangle_mesh):
     else:
         assert (found.visual.vertex_colors[:, :3] == triangle_mesh.colors).all()
         assert (found.faces == triangle_mesh.triangles).all()
-
-
-def test_ply_mesh_by_a_second_reader(triangle_mesh):
-    data = PlyData.read(io.BytesIO(encode_mesh(triangle_mesh, "ply", "opencv")))
-    assert np.array_equal(np.stack(data["face"]["vertex_indices"]), triangle_mesh.triangles)
-    assert np.array_equal(np.column_stack([data["vertex"][c] for c in ("red", "green", "blue")]), triangle_mesh.colors)
 
 
 def fans(triangles, vertex):

@@ -16,7 +16,7 @@ from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.checkpoint import deferred_interrupt
+from endoprior.runs.folder import deferred_interrupt
 from endoprior.runs.train import train
 from endoprior.system import atomic
 from endoprior.system.atomic import CannotWrite, whole_file, whole_folder
@@ -34,34 +34,25 @@ SHORT = [
 ]  # fmt: skip
 
 
-class Broken(Exception):
-    """A library's error with the system's words inside."""
-
-
 def test_a_file_appears_whole_or_not_at_all(tmp_path):
     path = tmp_path / "new" / "file.txt"
     with whole_file(path) as temporary:
+        temporary.touch(mode=0o600)
         temporary.write_text("first")
         assert not path.exists()
+    (tmp_path / "b").touch()
+    assert path.stat().st_mode == (tmp_path / "b").stat().st_mode, "the usual permissions"
     with pytest.raises(ZeroDivisionError), whole_file(path) as temporary:
         temporary.write_text("half")
         raise ZeroDivisionError
     assert path.read_text() == "first" and list(path.parent.iterdir()) == [path]
 
 
-def test_files_get_the_usual_permissions(tmp_path):
-    with whole_file(tmp_path / "a") as temporary:
-        temporary.touch(mode=0o600)
-    (tmp_path / "b").touch()
-    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
-
-
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (OSError(28, "No space left on device"), "No space left"),
         (OSError(27, "File too large"), "File too large"),
-        (Broken("I/O error: No space left on device (os error 28)"), "No space left"),
+        (RuntimeError("I/O error: No space left on device (os error 28)"), "No space left"),  # of a library
     ],
 )
 def test_a_disk_that_refuses_is_named_with_its_reason(tmp_path, error, words):

@@ -56,12 +56,6 @@ def test_a_round_border_is_measured(circle):
     assert np.allclose((found.center_x, found.center_y, found.radius), circle, atol=0.6)
 
 
-def test_dark_corners_are_no_round_border():
-    y, x = np.mgrid[:120, :160]
-    fall = np.clip(1.25 - np.hypot(x - 80, y - 60) / 100, 0.02, 1)[..., None]  # light falls off smoothly
-    assert find_circle([(image * fall).astype(np.uint8) for image in tissue()]) is None
-
-
 def moved(image, shift=0.0, degrees=0.0, zoom=1.0):
     height, width = image.shape[:2]
     matrix = cv2.getRotationMatrix2D((width / 2, height / 2), degrees, zoom)

@@ -314,9 +314,7 @@ def test_prepare_tells_images_from_masks_in_one_folder(tmp_path, capsys):
     code, got, said = prepared(tmp_path, capsys, "--masks", str(tmp_path / "images"))
     assert code == 0 and all((a == b).all() for a, b in zip(got, masks, strict=True))
     assert "5 of 10 files are images; not f#_mask.png (5)" in said.out
-    assert open_mask_folder(tmp_path / "images").note.startswith(
-        f"{tmp_path / 'images'}: 5 of 10 files are masks; not "
-    )
+    assert ": 5 of 10 files are masks; not " in open_mask_folder(tmp_path / "images").note
     write(tmp_path / "images", [f"{name}.jpg" for name in names], images)
     (tmp_path / "out").rename(tmp_path / "before")
     code, _, said = prepared(tmp_path, capsys, "--masks", "none")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import numba
 import numpy as np
@@ -16,7 +17,7 @@ from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid, mapped_zeros
 from endoprior.model.hexplane_numba import CHUNK, hexplane_linear
 from endoprior.training.adam import PlaneAdam
-from endoprior.training.adam_numba import adam_planes_step, step_cells
+from endoprior.training.adam import adam_planes_step_numba as adam_planes_step
 
 
 def planes_of(grid: PlaneGrid, source: Tensor | None = None) -> list[list[Tensor]]:
@@ -260,6 +261,13 @@ def test_thread_count_changes_no_bit() -> None:
         numba.set_num_threads(threads)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def step_cells(values, grads, exp_avg, exp_avg_sq, marks, step: int, rate: float, epsilon: float) -> None:
+    """Step number `step` of cells on their own."""
+    grid = SimpleNamespace(values=values, grads=grads, marks=marks)
+    moments = {"exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}
+    adam_planes_step(SimpleNamespace(grid=grid, steps=torch.tensor(step - 1), epsilon=epsilon, **moments), rate)
 
 
 def test_adam_equals_dense_adam() -> None:

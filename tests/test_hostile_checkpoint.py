@@ -3,27 +3,28 @@
 import numpy as np
 import pytest
 import torch
+from conftest import write_tiny_sequence
 from state_files import StateFile
+from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.checkpoint import check_state, load_checkpoint
+from endoprior.runs.folder import check_state, load_checkpoint
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
 
-@pytest.fixture(scope="module", params=["basis", pytest.param("hexplane", marks=pytest.mark.slow)])
-def run(request, tmp_path_factory):
-    """A short training: what made it, and its checkpoint taken apart."""
-    from conftest import write_tiny_sequence
-    from tiny_training import tiny_config
-
-    folder = tmp_path_factory.mktemp("checkpoint")
+def trained(folder, cfg):
+    """A short training: what made it, and its checkpoint, as a file and taken apart."""
     sequence = load_sequence(write_tiny_sequence(folder / "data"))
-    cfg = tiny_config(request.param, coarse=2, fine=3)
     train(sequence, cfg, folder / "run")
     file = folder / "run" / "checkpoint.safetensors"
     return GaussianTrainer(sequence, cfg), file, StateFile.read(file)
+
+
+@pytest.fixture(scope="module", params=["basis", pytest.param("hexplane", marks=pytest.mark.slow)])
+def run(request, tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("checkpoint"), tiny_config(request.param, coarse=2, fine=3))
 
 
 def resume(run) -> GaussianTrainer:
@@ -63,9 +64,8 @@ def test_each_array_of_a_checkpoint_is_checked(run):
         for changed in (None, values.astype(wrong), values[..., None], np.concatenate([values, values])):
             if changed is not None and changed.size == 0 == values.size and changed.dtype == values.dtype:
                 continue
-            arrays = {k: v for k, v in stored.arrays.items() if k != name} | (
-                {} if changed is None else {name: changed}
-            )
+            arrays = {k: v for k, v in stored.arrays.items() if k != name}
+            arrays |= {} if changed is None else {name: changed}
             StateFile(stored.about, arrays).write(file)
             with pytest.raises(InputError, match=r"checkpoint\.safetensors: expected"):
                 resume(run)
@@ -108,16 +108,10 @@ def test_moments_and_counts_that_cannot_be(run):
 
 def test_tracks_of_another_sequence(tmp_path):
     """Tracks of fewer frames than the sequence has are named; those of all of them are taken over."""
-    from conftest import write_tiny_sequence
-    from tiny_training import tiny_config
-
-    sequence = load_sequence(write_tiny_sequence(tmp_path / "data"))
     cfg = tiny_config("basis", coarse=0, fine=1).replace({"init.motion": "flow", "loss.track_weight": 0.01})
-    train(sequence, cfg, tmp_path / "run")
-    file = tmp_path / "run" / "checkpoint.safetensors"
-    taken = (GaussianTrainer(sequence, cfg), file, StateFile.read(file))
-    assert resume(taken).state.tracks.followed.shape[1] == len(sequence.indices("train"))
-    followed = taken[2].arrays["tracks.followed"]
-    StateFile(taken[2].about, taken[2].arrays | {"tracks.followed": followed[:, 1:]}).write(file)
+    taken = trainer, file, stored = trained(tmp_path, cfg)
+    assert resume(taken).state.tracks.followed.shape[1] == len(trainer.sequence.indices("train"))
+    followed = stored.arrays["tracks.followed"]
+    StateFile(stored.about, stored.arrays | {"tracks.followed": followed[:, 1:]}).write(file)
     with pytest.raises(InputError, match=r"training frames in tracks\.followed"):
         resume(taken)

@@ -13,16 +13,14 @@ import msgspec
 import numpy as np
 import pytest
 from export_scenes import moving_scene
-from view_client import Client, at_work
+from view_client import Client, at_work, camera_message
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from endoprior.core.checks import InputError
 from endoprior.view import panel as panels
-from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, is_valid_message
-from endoprior.view.job_queue import MAX_WAITING, JobQueue
+from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, MAX_WAITING, JobQueue, is_valid_message
 from endoprior.view.panel import ORBIT, control_id
-from endoprior.view.saving import keep
-from endoprior.view.server import MAX_KEPT, Viewer
+from endoprior.view.server import MAX_KEPT, Viewer, keep
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewport import bounded_aspect
 
@@ -116,7 +114,7 @@ def test_malformed_frames(viewer, good):
     assert resident_mb() - before < 100
 
 
-def messages(viewer, client) -> list[dict]:
+def messages(viewer) -> list[dict]:
     """Well-formed messages that no browser would send."""
     odd = ["x", None, [], {}, [1], True, 2**63, -(2**63), 1e308, np.nan, np.inf, -1, [np.nan] * 2, "x" * 10_000]
     odd.append([[]] * 50)
@@ -129,9 +127,9 @@ def messages(viewer, client) -> list[dict]:
         found += [gui(ids["frame"], **{name: value}) for value in ([], None, True, "x")]
     found += [gui("nobody", value=1), gui([1], value=1), gui(ids["frame"]) | {"updates": 3}]
     for name in ("wxyz", "position", "up_direction", "fov", "image_height", "image_width"):
-        found += [client.camera(**{name: value}) for value in odd[len(name) % 2 :: 2]]
-    found += [client.camera(wxyz=[0] * 4), client.camera(position=[1e308] * 3), client.camera(fov=0)]
-    found += [client.camera(image_width=10**9, image_height=1), client.camera(image_width=0, image_height=0)]
+        found += [camera_message(**{name: value}) for value in odd[len(name) % 2 :: 2]]
+    found += [camera_message(wxyz=[0] * 4), camera_message(position=[1e308] * 3), camera_message(fov=0)]
+    found += [camera_message(image_width=10**9, image_height=1), camera_message(image_width=0, image_height=0)]
     ray = {"ray_origin": [0, 0, 0], "ray_direction": [0, 0, 1], "modifier": None}
     for place in ([], [[]], [[np.nan, 0]], [[1e308, 1e308]], [["x", "y"]], [[0.5, 0.5]] * 1000, 3, None):
         for kind in ("click", "rect-select", "no such", 3):
@@ -158,12 +156,6 @@ class Stranger(Client):
         self.again = lambda: Client.__init__(self, url, close_timeout=0.01, **options)
         self.again()
 
-    def camera(self, **changes) -> dict:
-        """The message with the position of the camera."""
-        place = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "look_at": [0, 0, 60], "up_direction": [0, -1, 0]}
-        size = {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
-        return {"type": "ViewerCameraMessage", **place, **size, **changes}
-
     def say(self, message: dict) -> None:
         try:
             raw = msgspec.msgpack.encode(message)
@@ -184,9 +176,9 @@ def test_messages_that_no_browser_sends(viewer, good, capfd):
     state = {name: handle.value for name, handle in vars(viewer.panel).items() if hasattr(handle, "value")}
     before, stranger = resident_mb(), Stranger(viewer.url, max_queue=None)
     stranger.send_camera()
-    for message in messages(viewer, stranger):
+    for message in messages(viewer):
         stranger.say(message)
-    stranger.say(stranger.camera())
+    stranger.say(camera_message())
     time.sleep(0.5)
     stranger.socket.close()
     # True and 1 are values that some of them can have.
@@ -281,7 +273,7 @@ def test_saved_views_are_limited(viewer, good):
 
 def test_messages_are_validated():
     def sane(**changes):
-        return is_valid_message(Stranger.camera(None, **changes), lambda *_: True)
+        return is_valid_message(camera_message(**changes), lambda *_: True)
 
     assert sane() and sane(image_width=0) and not sane(fov=np.nan) and not sane(position=(np.inf, 0, 0))
     for kind in ("RemoveSceneNodeMessage", "FileTransferStartUpload", "FileTransferPart"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from browser import pictures_folder
-from player_page import RATE, WIDTH, open_player, picture, random_scene, rendered, settle, unpack
+from player_page import RATE, WIDTH, open_player, picture, random_scene, rendered, settle, unpack, with_script
 
 from endoprior.core.checks import InputError
 from endoprior.export.html import write_html
@@ -235,7 +235,6 @@ def test_one_frame_is_a_still(scene, browser, kept):
     assert not browser.problems
 
 
-BEFORE = "Page.addScriptToEvaluateOnNewDocument"
 DYING = "terminate() {} postMessage() { setTimeout(() => this.onerror(new Event('error'))); }"
 
 
@@ -249,16 +248,13 @@ DYING = "terminate() {} postMessage() { setTimeout(() => this.onerror(new Event(
     ids=["rejected", "dies"],
 )
 def test_without_workers_the_page_sorts_by_itself(scene, browser, player, kept, code):
-    script = browser.send(BEFORE, source=code)["identifier"]
-    try:
+    with with_script(browser, code):
         open_player(browser, player)
         browser.press("End")
         settle(browser, NUM_FRAMES - 1)
         want = rendered(scene, (NUM_FRAMES - 1) / NUM_FRAMES)
         assert np.abs(picture(browser, kept / "alone.png") - want).mean() < 0.65
         assert not browser.problems
-    finally:
-        browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
 
 
 @pytest.mark.slow
@@ -285,11 +281,8 @@ def test_a_lost_graphics_card_comes_back(page, kept):
     ],
 )
 def test_a_browser_that_cannot_says_so_on_the_page(browser, player, kept, code, says):
-    script = browser.send(BEFORE, source=code)["identifier"]
-    try:
+    with with_script(browser, code):
         browser.go(player.as_uri())
         browser.wait_for("document.body.dataset.state == 'failed'")
         browser.screenshot(kept / "failed.png")
         assert says in browser.evaluate("message.textContent")
-    finally:
-        browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=script)

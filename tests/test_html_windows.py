@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from browser import Page, pictures_folder
-from player_page import HEIGHT, RATE, WIDTH, open_player, picture, random_scene, rendered, settle, unpack
+from player_page import RATE, WIDTH, open_player, picture, random_scene, rendered, settle, unpack, with_script
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
@@ -39,7 +39,7 @@ def camera(frame: int) -> Camera:
     """A camera that moves to the right and turns."""
     pose = random_scene(2, NUM_FRAMES).cameras[frame].world_to_camera.copy()
     pose[0, 3] -= 1.5 * frame
-    return Camera(WIDTH, HEIGHT, 300.0, 310.0, 150.0, 137.0, pose)
+    return replace(random_scene(2, 1).cameras[0], world_to_camera=pose)
 
 
 @pytest.fixture(scope="module")
@@ -185,13 +185,9 @@ def test_the_free_view_goes_along(scene, page):
 
 @pytest.mark.slow
 def test_without_workers_the_page_unpacks_by_itself(scene, browser, player):
-    code = "window.Worker = class { constructor() { throw new Error('none here'); } };"
-    script = browser.send("Page.addScriptToEvaluateOnNewDocument", source=code)["identifier"]
-    try:
+    with with_script(browser, "window.Worker = class { constructor() { throw new Error('none here'); } };"):
         open_player(browser, player)
         for frame in (13, 6):
             seek(browser, frame)
             same_as_rendered(browser, scene, frame)
         assert not browser.problems
-    finally:
-        browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=script)

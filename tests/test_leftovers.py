@@ -57,7 +57,7 @@ def test_a_rejected_training_removes_nothing(tiny_sequence, tmp_path, capsys):
     before = sorted(out.iterdir())
     assert main(["train", str(tiny_sequence), str(out), "--no-networks"]) == 2
     assert sorted(out.iterdir()) == before and "one with files in it" in capsys.readouterr().err
-    with pytest.raises(InputError, match="a checkpoint to resume from"):
+    with pytest.raises(InputError, match="a run to resume"):
         train(load_sequence(tiny_sequence), tiny_config("basis"), out, resume=True)
     assert sorted(path for path in out.iterdir() if path.name != ".lock") == before
 

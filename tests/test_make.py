@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1]
 TARGET = ".venv/.test-installed"
 OLD = "sys.version_info = (3, 9, 2, 'final', 0)"
 WITHOUT_VENV = "sys.modules['ensurepip'] = None"
+PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
 RECORDS = '#!/bin/sh\necho "{name} $*" >> calls\ncase "$*" in *.venv) mkdir -p .venv/bin; {then};; esac\n'
 
 pytestmark = pytest.mark.skipif(not shutil.which("make"), reason="make is not installed")
@@ -37,11 +38,6 @@ def program(checkout: Path, name: str, text: str) -> None:
     path.chmod(0o755)
 
 
-def python_with(change: str) -> str:
-    """A Python that runs this statement before the code it is given."""
-    return f'#!/bin/sh\nexec {sys.executable} -c "import sys; {change}; exec(sys.argv[1])" "$2"\n'
-
-
 def make(checkout: Path, *words: str, target: str = TARGET) -> subprocess.CompletedProcess[str]:
     """Run `make` in the checkout, with nothing but its programs."""
     ours = ("PYTHON", "TORCH_INDEX", "MAKEFLAGS", "MFLAGS", "MAKELEVEL")
@@ -53,25 +49,25 @@ def make(checkout: Path, *words: str, target: str = TARGET) -> subprocess.Comple
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "says"),
+    ("name", "change", "says"),
     [
-        ("python3", None, "python3: expected Python 3.11 or newer, got none. Fix: Install it"),
-        ("python3", python_with(OLD), "python3: expected Python 3.11 or newer, got 3.9. Fix: Install it"),
-        ("python9", python_with(OLD), "python9: expected Python 3.11 or newer, got 3.9. Fix: Install it"),
+        ("python3", "", "expected Python 3.11 or newer, got none. Fix: Install it"),
+        ("python3", OLD, "expected Python 3.11 or newer, got 3.9. Fix: Install it"),
+        ("python9", OLD, "expected Python 3.11 or newer, got 3.9. Fix: Install it"),
         (
             "python3",
-            python_with(WITHOUT_VENV),
-            "python3: expected the modules venv and ensurepip, got none. "
-            f"Fix: `sudo apt install python{sys.version_info.major}.{sys.version_info.minor}-venv`",
+            WITHOUT_VENV,
+            f"expected the modules venv and ensurepip, got none. Fix: `sudo apt install {PYTHON}-venv`",
         ),
     ],
 )
-def test_what_python_lacks_is_one_line_with_the_fix(checkout, name, text, says):
-    if text:
-        program(checkout, name, text)
+def test_what_python_lacks_is_one_line_with_the_fix(checkout, name, change, says):
+    if change:  # a Python that runs this statement before the code it is given
+        text = f'exec {sys.executable} -c "import sys; {change}; exec(sys.argv[1])" "$2"'
+        program(checkout, name, f"#!/bin/sh\n{text}\n")
     done = make(checkout, *([] if name == "python3" else [f"PYTHON={name}"]))
     lines = [line for line in done.stderr.splitlines() if not line.startswith("make")]
-    assert done.returncode == 2 and len(lines) == 1 and lines[0].startswith(f"endoprior: {says}")
+    assert done.returncode == 2 and len(lines) == 1 and lines[0].startswith(f"endoprior: {name}: {says}")
     assert not (checkout / ".venv").exists()
 
 

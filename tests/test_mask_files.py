@@ -13,10 +13,7 @@ from endoprior.data.mask_files import read_user_mask, tool_polarity
 SIZE = (64, 48)
 TRUE = np.zeros((48, 64), bool)
 TRUE[10:40, 20:50] = True
-INNER, OUTER = (
-    (cv2.erode(TRUE.astype(np.uint8), np.ones((5, 5))) > 0),
-    (cv2.dilate(TRUE.astype(np.uint8), np.ones((5, 5))) > 0),
-)
+INNER, OUTER = (change(TRUE.astype(np.uint8), np.ones((5, 5))) > 0 for change in (cv2.erode, cv2.dilate))
 U8 = TRUE.astype(np.uint8)
 LABELS = U8 + U8 * (np.arange(64) > 30)  # two parts of a tool, 1 and 2
 

@@ -3,36 +3,10 @@
 import json
 
 import cv2
+import mask_layouts as by
 import numpy as np
 import pytest
-from mask_layouts import (
-    FRAMES,
-    HEIGHT,
-    SIZE,
-    WIDTH,
-    cvat,
-    cvat_green_background,
-    cvat_indices,
-    cvat_xml,
-    gray_png,
-    jaw,
-    label_studio,
-    label_studio_numpy,
-    label_studio_twins,
-    nerfstudio,
-    packed,
-    palette_png,
-    plain,
-    runs_of,
-    sam2_light_background,
-    sam2_objects,
-    sam2_palette,
-    sam2_video,
-    sam2_video_objects,
-    sav,
-    shaft,
-    tissue,
-)
+from mask_layouts import FRAMES, HEIGHT, SIZE, WIDTH, jaw, shaft, tissue
 from video_files import write_video
 
 from endoprior.cli import main
@@ -44,21 +18,21 @@ from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.first_pass import source_facts
 
 LAYOUTS = {
-    sam2_palette: "SAM 2, palette images",
-    sam2_light_background: "SAM 2, palette images",
-    sam2_video: "SAM 2, palette images",
-    sam2_objects: "SAM 2, a folder per object",
-    sam2_video_objects: "SAM 2, a folder per object",
-    sav: "SA-V annotations",
-    cvat: "CVAT segmentation masks; tools: shaft, jaw; not tools: tissue",
-    cvat_green_background: "CVAT segmentation masks",
-    cvat_indices: "CVAT segmentation masks",
-    cvat_xml: "CVAT for images; tools: shaft, jaw; not tools: tissue; shapes left out: 4 of box",
-    label_studio: "Label Studio brush labels; tools: Needle-driver, Shaft; not tools: tissue; tasks are matched",
-    label_studio_numpy: "Label Studio brush labels",
-    label_studio_twins: "Label Studio brush labels",
-    nerfstudio: "nerfstudio masks; tools: where a mask is 0",
-    plain: "",
+    by.sam2_palette: "SAM 2, palette images",
+    by.sam2_light_background: "SAM 2, palette images",
+    by.sam2_video: "SAM 2, palette images",
+    by.sam2_objects: "SAM 2, a folder per object",
+    by.sam2_video_objects: "SAM 2, a folder per object",
+    by.sav: "SA-V annotations",
+    by.cvat: "CVAT segmentation masks; tools: shaft, jaw; not tools: tissue",
+    by.cvat_green_background: "CVAT segmentation masks",
+    by.cvat_indices: "CVAT segmentation masks",
+    by.cvat_xml: "CVAT for images; tools: shaft, jaw; not tools: tissue; shapes left out: 4 of box",
+    by.label_studio: "Label Studio brush labels; tools: Needle-driver, Shaft; not tools: tissue; tasks are matched",
+    by.label_studio_numpy: "Label Studio brush labels",
+    by.label_studio_twins: "Label Studio brush labels",
+    by.nerfstudio: "nerfstudio masks; tools: where a mask is 0",
+    by.plain: "",
 }
 
 
@@ -66,18 +40,18 @@ LAYOUTS = {
 def test_every_layout_gives_the_same_masks(tmp_path, write):
     write(tmp_path / "given")
     found = open_mask_folder(tmp_path / "given")
-    assert found.note.startswith(LAYOUTS[write]) and bool(found.note) == (write is not plain)
-    assert found.tool_is_high == {nerfstudio: False, plain: None}.get(write, True)
+    assert found.note.startswith(LAYOUTS[write]) and bool(found.note) == (write is not by.plain)
+    assert found.tool_is_high == {by.nerfstudio: False, by.plain: None}.get(write, True)
     assert len(found.frames) == FRAMES
     for i, frame in enumerate(found.frames):
-        want = shaft(i) | jaw(i) if i or write not in (sam2_objects, sam2_video_objects) else shaft(i)
+        want = shaft(i) | jaw(i) if i or write not in (by.sam2_objects, by.sam2_video_objects) else shaft(i)
         mask = frame.read(SIZE)
         mask = ~mask if found.tool_is_high is False else mask
-        if write is cvat_xml:  # a polygon has no exact pixels
+        if write is by.cvat_xml:  # a polygon has no exact pixels
             assert (mask ^ want).sum() <= 2 * (10 + 17)
         else:
             assert (mask == want).all()
-        if write is not plain or i:
+        if write is not by.plain or i:
             with pytest.raises(InputError, match=f"{WIDTH}x{HEIGHT}"):
                 frame.read((WIDTH + 2, HEIGHT))
 
@@ -85,39 +59,36 @@ def test_every_layout_gives_the_same_masks(tmp_path, write):
 @pytest.mark.parametrize(
     ("write", "labels", "want"),
     [
-        (sam2_palette, "2", [jaw]),
-        (sam2_objects, "1", [shaft]),
-        (sav, "1", [jaw]),
-        (cvat, "jaw", [jaw]),
-        (cvat, "Tissue, shaft", [tissue, shaft]),
-        (cvat_xml, "shaft", [shaft]),
-        (label_studio, "needle-driver", [jaw]),
+        (by.sam2_palette, "2", [jaw]),
+        (by.sam2_objects, "1", [shaft]),
+        (by.sav, "1", [jaw]),
+        (by.cvat, "jaw", [jaw]),
+        (by.cvat, "Tissue, shaft", [tissue, shaft]),
+        (by.cvat_xml, "shaft", [shaft]),
+        (by.label_studio, "needle-driver", [jaw]),
     ],
 )
 def test_labels_can_be_chosen(tmp_path, write, labels, want):
     write(tmp_path / "given")
     frame = open_mask_folder(tmp_path / "given", labels).frames[1]
     wanted = np.any([part(1) for part in want], axis=0)
-    if (write, labels) == (cvat, "Tissue, shaft"):
+    if (write, labels) == (by.cvat, "Tissue, shaft"):
         wanted &= ~jaw(1)  # painted over
     assert (frame.read(SIZE) == wanted).all()
 
 
 PARTS = {
-    "SegmentationClass": cvat,
-    "annotations.xml": cvat_xml,
-    "sav_000001_manual.json": sav,
-    "masks": nerfstudio,
-    "masks_2": nerfstudio,
+    "SegmentationClass": by.cvat,
+    "annotations.xml": by.cvat_xml,
+    "sav_000001_manual.json": by.sav,
+    "masks": by.nerfstudio,
+    "masks_2": by.nerfstudio,
 }
 
 
 @pytest.mark.parametrize("inner", PARTS)
 def test_a_part_of_a_layout_is_enough(tmp_path, inner):
-    write = {"SegmentationClass": cvat, "annotations.xml": cvat_xml, "sav_000001_manual.json": sav}.get(
-        inner, nerfstudio
-    )
-    write(tmp_path / "given")
+    PARTS[inner](tmp_path / "given")
     size = SIZE if inner != "masks_2" else (WIDTH // 2, HEIGHT // 2)
     found, whole = (open_mask_folder(tmp_path / part) for part in (f"given/{inner}", "given"))
     assert found.note == whole.note and found.tool_is_high == whole.tool_is_high
@@ -126,20 +97,20 @@ def test_a_part_of_a_layout_is_enough(tmp_path, inner):
 
 def test_palette_images_of_grays_are_plain_masks(tmp_path):
     for i in range(FRAMES):
-        palette_png(tmp_path / f"{i:05d}.png", shaft(i), [255, 255, 255, 0, 0, 0])
+        by.palette_png(tmp_path / f"{i:05d}.png", shaft(i), [255, 255, 255, 0, 0, 0])
     found = open_mask_folder(tmp_path)
     assert found.note == "" and found.tool_is_high is None and (found.frames[1].read(SIZE) == ~shaft(1)).all()
 
 
 def test_images_of_a_cvat_task_without_a_shape_have_empty_masks(tmp_path):
-    folder = cvat(tmp_path / "given")
+    folder = by.cvat(tmp_path / "given")
     (folder / "SegmentationClass" / "frame_000002.png").unlink()
     masks = [frame.read(SIZE) for frame in open_mask_folder(folder).frames]
     assert [bool(mask.any()) for mask in masks] == [True, True, False, True]
 
 
 def test_frames_of_sav_are_numbered_by_the_video(tmp_path):
-    sav(tmp_path)
+    by.sav(tmp_path)
     file = tmp_path / "sav_000001_manual.json"
     stored = json.loads(file.read_text()) | {"video_frame_count": 13.0}
     stored["masklet"][1][0] = None  # out of view
@@ -151,7 +122,7 @@ def test_frames_of_sav_are_numbered_by_the_video(tmp_path):
 
 @pytest.mark.parametrize("facts", [{"video_frame_count": float("nan")}, {"masklet_id": 7}, {"masklet_id": [1]}])
 def test_odd_facts_of_sav_are_left_out(tmp_path, facts):
-    sav(tmp_path)
+    by.sav(tmp_path)
     file = tmp_path / "sav_000001_manual.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | facts))
     found = open_mask_folder(file)
@@ -190,16 +161,16 @@ def test_run_lengths():
         mask = cv2.blur(rng.random((HEIGHT, WIDTH)), (9, 9)) > np.quantile(
             cv2.blur(rng.random((48, 64)), (9, 9)), share
         )
-        runs = runs_of(mask.T.ravel())
-        assert (mask_of_coco(packed(runs), (HEIGHT, WIDTH)) == mask).all()
+        runs = by.runs_of(mask.T.ravel())
+        assert (mask_of_coco(by.packed(runs), (HEIGHT, WIDTH)) == mask).all()
         assert (mask_of_coco(runs, (HEIGHT, WIDTH)) == mask).all()
-    for wrong in ("o", "\x01", packed([2, 3]), [1 << 62, 1 << 62, 1 << 62, (1 << 62) + 16], [-1, 17]):
+    for wrong in ("o", "\x01", by.packed([2, 3]), [1 << 62, 1 << 62, 1 << 62, (1 << 62) + 16], [-1, 17]):
         with pytest.raises(ValueError):
             mask_of_coco(wrong, (4, 4))
 
 
 def damaged_rle(folder):
-    cvat_xml(folder)
+    by.cvat_xml(folder)
     file = folder / "annotations.xml"
     file.write_text(file.read_text().replace('rle="', 'rle="7, '))
 
@@ -215,13 +186,13 @@ def edited(write, file, old, new):
 
 
 def two_videos(folder):
-    sam2_palette(folder / "a")
-    sam2_palette(folder / "b")
+    by.sam2_palette(folder / "a")
+    by.sam2_palette(folder / "b")
 
 
 def foreign_color(folder):
-    cvat(folder)
-    gray_png(folder / "SegmentationClass" / "frame_000000.png", np.full((HEIGHT, WIDTH, 3), (3, 2, 1)))
+    by.cvat(folder)
+    by.gray_png(folder / "SegmentationClass" / "frame_000000.png", np.full((HEIGHT, WIDTH, 3), (3, 2, 1)))
 
 
 def nothing(folder):
@@ -230,17 +201,17 @@ def nothing(folder):
 
 BAD = {
     "run lengths of": damaged_rle,
-    "a box outside": edited(cvat_xml, "annotations.xml", 'left="5"', 'left="60"'),
-    "the attribute 'top', got none": edited(cvat_xml, "annotations.xml", 'top="0"', ""),
-    "points that are not": edited(cvat_xml, "annotations.xml", "3.00,20.00;", "3.00;"),
-    "a document type": edited(cvat_xml, "annotations.xml", "<annotations>", "<!DOCTYPE a><annotations>"),
-    "CVAT's XML, got no element": edited(cvat_xml, "annotations.xml", "</annotations>", ""),
-    "tracks of a video": edited(cvat_xml, "annotations.xml", "image", "track"),
-    "label:red,green,blue": edited(cvat, "labelmap.txt", "61,61,245", "61"),
-    "label:red,green,blue:parts:actions, got shaft:999": edited(cvat, "labelmap.txt", "61,61,245", "999,61,245"),
+    "a box outside": edited(by.cvat_xml, "annotations.xml", 'left="5"', 'left="60"'),
+    "the attribute 'top', got none": edited(by.cvat_xml, "annotations.xml", 'top="0"', ""),
+    "points that are not": edited(by.cvat_xml, "annotations.xml", "3.00,20.00;", "3.00;"),
+    "a document type": edited(by.cvat_xml, "annotations.xml", "<annotations>", "<!DOCTYPE a><annotations>"),
+    "CVAT's XML, got no element": edited(by.cvat_xml, "annotations.xml", "</annotations>", ""),
+    "tracks of a video": edited(by.cvat_xml, "annotations.xml", "image", "track"),
+    "label:red,green,blue": edited(by.cvat, "labelmap.txt", "61,61,245", "61"),
+    "label:red,green,blue:parts:actions, got shaft:999": edited(by.cvat, "labelmap.txt", "61,61,245", "999,61,245"),
     "only colors of labelmap.txt, got 1,2,3": foreign_color,
-    "run lengths that fill": edited(sav, "sav_000001_manual.json", '"counts": "', '"counts": "3'),
-    "a list of objects per frame": edited(sav, "sav_000001_manual.json", '"masklet": [[', '"masklet": [3, ['),
+    "run lengths that fill": edited(by.sav, "sav_000001_manual.json", '"counts": "', '"counts": "3'),
+    "a list of objects per frame": edited(by.sav, "sav_000001_manual.json", '"masklet": [[', '"masklet": [3, ['),
     "the folders a, b": two_videos,
     "got none": nothing,
 }
@@ -258,13 +229,16 @@ def test_damage_is_one_line_that_names_the_file(tmp_path, says):
 
 @pytest.mark.parametrize(
     ("write", "says"),
-    [(plain, r"labels of \S+ \(0, 255\), got shaft"), (nerfstudio, "masks with labels, got masks of one kind")],
+    [
+        (by.plain, r"labels of \S+ \(0, 255\), got shaft"),
+        (by.nerfstudio, "masks with labels, got masks of one kind"),
+    ],
 )
 def test_labels_of_masks_without_labels_are_an_error(tmp_path, write, says):
     write(tmp_path / "given")
     with pytest.raises(InputError, match=f"--mask-labels: expected {says}"):
         open_mask_folder(tmp_path / "given", "shaft")
-    cvat(tmp_path / "cvat")
+    by.cvat(tmp_path / "cvat")
     with pytest.raises(InputError, match=r"--mask-labels: .*\(shaft, jaw, tissue\), got grasper"):
         open_mask_folder(tmp_path / "cvat", "grasper")
 
@@ -279,25 +253,25 @@ def video(folder):
 OPTIONS = {"depth": "none", "poses": "still", "border": "keep"}
 
 
-@pytest.mark.parametrize("write", [sam2_objects, cvat, label_studio, nerfstudio, cvat_xml])
+@pytest.mark.parametrize("write", [by.sam2_objects, by.cvat, by.label_studio, by.nerfstudio, by.cvat_xml])
 def test_prepare_reads_them_and_says_what_it_recognized(tmp_path, write):
     write(tmp_path / "given")
     done = prepare(video(tmp_path), tmp_path / "out", PrepareConfig(masks=str(tmp_path / "given"), **OPTIONS))
     assert any(note.startswith(f"masks: {LAYOUTS[write]}") for note in done.notes)
     for i, file in enumerate(sorted((done.out / "masks").glob("*.png"))):
-        want = shaft(i) if write is sam2_objects and i == 0 else shaft(i) | jaw(i)
-        assert (read_tool_mask(file) ^ want).sum() <= (2 * 27 if write is cvat_xml else 0)
+        want = shaft(i) if write is by.sam2_objects and i == 0 else shaft(i) | jaw(i)
+        assert (read_tool_mask(file) ^ want).sum() <= (2 * 27 if write is by.cvat_xml else 0)
 
 
 def test_the_polarity_of_a_layout_can_be_overridden(tmp_path):
-    nerfstudio(tmp_path / "given")
+    by.nerfstudio(tmp_path / "given")
     cfg = PrepareConfig(masks=str(tmp_path / "given"), mask_tool_value="high", **OPTIONS)
     done = prepare(video(tmp_path), tmp_path / "out", cfg)
     assert (read_tool_mask(done.out / "masks" / "000001.png") == ~(shaft(1) | jaw(1))).all()
 
 
 def test_tasks_of_label_studio_must_be_as_many_as_frames(tmp_path, capsys):
-    label_studio(tmp_path / "given", first=0)
+    by.label_studio(tmp_path / "given", first=0)
     for file in (tmp_path / "given").glob("task-3-*"):
         file.unlink()
     words = ["prepare", str(video(tmp_path)), str(tmp_path / "out"), "--depth", "none", "--masks"]
@@ -309,7 +283,7 @@ def test_tasks_of_label_studio_must_be_as_many_as_frames(tmp_path, capsys):
 
 
 def test_a_changed_mask_in_an_inner_folder_changes_the_identity(tmp_path):
-    sam2_objects(tmp_path / "given")
+    by.sam2_objects(tmp_path / "given")
     before = source_facts(tmp_path / "given")
-    palette_png(tmp_path / "given" / "001" / "00002.png", jaw(0))
+    by.palette_png(tmp_path / "given" / "001" / "00002.png", jaw(0))
     assert source_facts(tmp_path / "given") != before

@@ -19,8 +19,17 @@ from endoprior import load_sequence
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data.frame_files import BY_NAME, BY_NUMBER
-from endoprior.evaluation.mask_scores import NO_VALUE, SCORES, TOLERANCE, count, counted_pixels, scores_of, tips
-from endoprior.evaluation.true_masks import TrueMasks, score_masks
+from endoprior.evaluation.true_masks import (
+    NO_VALUE,
+    SCORES,
+    TOLERANCE,
+    TrueMasks,
+    count,
+    counted_pixels,
+    score_masks,
+    scores_of,
+    tips,
+)
 from endoprior.footage.border import Circle
 
 SHAPE = (240, 320)  # a diagonal of 400 px: outlines agree within exactly 3 px

@@ -49,11 +49,8 @@ def write(folder, frame, suffix=".png", options=()):
         if suffix == ".npy":
             np.save(folder / f"{i}.npy", values)
         else:
-            stored = (
-                values[..., ::-1]
-                if values.ndim == 3
-                else values.astype(values.dtype if values.dtype == np.uint16 else np.uint8)
-            )
+            stored = values[..., ::-1] if values.ndim == 3 else values
+            stored = stored if stored.dtype == np.uint16 else stored.astype(np.uint8)
             assert cv2.imwrite(str(folder / f"{i}{suffix}"), stored, list(options))
     return folder
 

@@ -58,11 +58,6 @@ def test_flow_error_sees_masked_images_and_scores_the_common_tissue():
         assert not first[:, 3:].any() and not second[:, :1].any()
 
 
-def test_a_pair_without_common_tissue_is_nan():
-    images = frames([(0, 0), (1, 1)])
-    assert np.isnan(flow_error(images, images, [MASK, ~MASK], BrightnessFlow()))
-
-
 @pytest.mark.parametrize("shift", [(3, 2), (-5, 4)])
 def test_dis_recovers_a_shift(shift):
     flow = dis_flow(texture(96, 128), texture(96, 128, shift))

@@ -175,14 +175,11 @@ def test_published_networks_load_the_published_weights(no_weights):
         assert distance(image, image, np.ones((64, 64), bool)) == 0
 
 
-def test_missing_weights_give_a_reason_and_no_other_network(no_weights):
+def test_missing_weights_and_those_of_another_network_give_a_reason(no_weights):
     with pytest.raises(WeightsMissing, match="no weights for RAFT-large"):
         raft_flow("large", no_weights, download=False)
     with pytest.raises(WeightsMissing, match="no weights for AlexNet"):
         lpips_distance("alex", no_weights, download=False)
-
-
-def test_weights_of_another_network_are_rejected(no_weights):
     save_file(constant_weights(import_torchvision().models.optical_flow.raft_small), no_weights / RAFT_LARGE.names[0])
     with pytest.raises(WeightsMissing, match=r"raft_large.safetensors: expected .* of shape"):
         raft_flow("large", no_weights, download=False)

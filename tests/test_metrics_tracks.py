@@ -13,15 +13,18 @@ from scipy.spatial import cKDTree
 from endoprior.core.types import Camera, Frame
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.truth import Tracks
-from endoprior.evaluation.predicted_tracks import PredictedTracks, by_chained_flow, true_tracks, without_motion
 from endoprior.evaluation.score import ScoreUnavailable
 from endoprior.evaluation.scorers.tracks import (
+    PredictedTracks,
+    by_chained_flow,
     near_tool,
     neighbor_breaks,
     parts_of,
     seen_again,
     track_accuracy,
     track_scores,
+    true_tracks,
+    without_motion,
 )
 from endoprior.phantom import PhantomConfig, write_phantom
 
@@ -226,14 +229,10 @@ def test_chained_flow_under_the_tool_moves_on_hidden_at_its_last_depth():
     np.testing.assert_allclose(tracks.pixels, true.pixels, atol=0.7)
 
 
-def test_chained_flow_outside_of_the_image_is_hidden():
+def test_chained_flow_hides_points_outside_of_the_image_and_those_whose_flow_does_not_return():
     sequence = moving_plane(6.0, points=((142.5, 60.5), (60.5, 60.5)))
-    true = true_tracks(sequence)
-    tracks = by_chained_flow(true, sequence)
+    tracks = by_chained_flow(true_tracks(sequence), sequence)
     assert not tracks.visible[4:, 0].any() and np.isfinite(tracks.pixels).all()
-
-
-def test_chained_flow_hides_a_point_whose_flow_does_not_return():
     sequence = moving_plane(0.0)
     for index in range(3, NUM_FRAMES):  # other tissue: no flow leads back
         sequence.frame(index).rgb_u8[:] = np.random.default_rng(index).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)

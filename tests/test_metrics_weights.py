@@ -17,13 +17,7 @@ from safetensors.torch import save_file
 
 from endoprior.core.checks import InputError
 from endoprior.evaluation import networks
-from endoprior.evaluation.networks import (
-    WeightFiles,
-    WeightsMissing,
-    find_weights,
-    load_weights,
-    select_weights,
-)
+from endoprior.evaluation.networks import WeightFiles, WeightsMissing, find_weights, load_weights, select_weights
 
 TOY = WeightFiles("ToyNet", ("toy.safetensors", "toy-0123abcd.pth"), "https://weights.invalid/toy-0123abcd.pth")
 

@@ -14,9 +14,15 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks, Truth
 from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
-from endoprior.evaluation.predicted_tracks import by_scene, true_tracks, without_motion
 from endoprior.evaluation.scorers import camera_path
-from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, track_scores
+from endoprior.evaluation.scorers.tracks import (
+    by_scene,
+    parts_of,
+    track_end_error_mm,
+    track_scores,
+    true_tracks,
+    without_motion,
+)
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.gaussians import Gaussians, motion_layout
 from endoprior.model.presets import preset

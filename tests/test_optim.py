@@ -11,7 +11,6 @@ from endoprior.core.config import OptimConfig
 from endoprior.model.gaussians import create_gaussians, motion_layout
 from endoprior.model.motion import RankOneGradient
 from endoprior.model.presets import preset
-from endoprior.training import adam_numba
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import BASIS_DECAY, Optimizer, late_share, log_linear, motion_rates, rate_of
@@ -25,7 +24,7 @@ def test_update_is_torchs_adam():
     for _ in range(10):
         ours.grad = torch.randn(7, 3, 5, generator=g)
         theirs.grad = ours.grad.clone()
-        adam_numba.adam_step([state], [ours], 1e-2, 1e-15)
+        NUMBA.adam_step([state], [ours], 1e-2, 1e-15)
         adam.step()
     # Ten steps of float32, rounded in another order.
     torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
@@ -39,8 +38,8 @@ def test_outer_product_gradients_are_the_written_out_ones():
     for _ in range(5):
         gradients = [RankOneGradient(rng.random(4).astype(np.float32), torch.randn(6, 3)) for _ in range(2)]
         dense.grad = torch.from_numpy(sum(np.einsum("b,nc->nbc", g.weights, g.v_offsets.numpy()) for g in gradients))
-        adam_numba.adam_basis_step(state, motion, gradients, np.full(3, 1e-2), 1e-15)
-        adam_numba.adam_step([adam], [dense], 1e-2, 1e-15)
+        NUMBA.adam_basis_step(state, motion, gradients, np.full(3, 1e-2), 1e-15)
+        NUMBA.adam_step([adam], [dense], 1e-2, 1e-15)
     torch.testing.assert_close(motion, dense, rtol=1e-5, atol=1e-6)  # float32 sums in another order
 
 
@@ -49,7 +48,7 @@ def test_basis_functions_without_weight_stay_unchanged():
     state = AdamState(motion, 4)
     for weights in ([1.0, 0.5, 0, 0], [0, 0, 0.5, 1.0]):
         gradient = RankOneGradient(np.array(weights, np.float32), torch.ones(2, 3))
-        adam_numba.adam_basis_step(state, motion, [gradient], np.array([1e-2, 1e-2, 0.0]), 1e-15)
+        NUMBA.adam_basis_step(state, motion, [gradient], np.array([1e-2, 1e-2, 0.0]), 1e-15)
     # Each was stepped once, so Adam's first step, of length lr, is all that happened; the last channel has rate 0.
     torch.testing.assert_close(motion.detach()[..., :2], torch.full((2, 4, 2), -1e-2))
     assert not motion.detach()[..., 2].any()

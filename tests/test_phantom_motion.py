@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.generate import build_scene
 from endoprior.phantom.motion import build_motion, smooth_step
 from endoprior.phantom.raster import FAR, rasterize
+from endoprior.phantom.scene import build_scene
 from endoprior.phantom.surface import build_anatomy, build_plane
 from endoprior.phantom.texture import smooth_patches
 
@@ -47,7 +47,7 @@ def test_regions_say_what_is_pulled_and_what_is_smooth(strong):
 
 @pytest.mark.parametrize("seed", [1, 8])
 def test_tissue_covers_the_image_whatever_moves_it(seed, monkeypatch):
-    monkeypatch.setattr("endoprior.phantom.generate.build_texture", lambda *_: None)
+    monkeypatch.setattr("endoprior.phantom.scene.build_texture", lambda *_: None)
     cfg = PhantomConfig(
         seed=seed, width=64, height=52, pull_mm=30, slide_mm=7.7, breathing_mm=8, focal_per_width=1.4, principal_x=41
     )

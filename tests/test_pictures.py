@@ -173,15 +173,6 @@ def test_what_a_method_renders_is_checked(sequence, color, depth, said):
         evaluate(Odd(color, depth), sequence, networks=False)
 
 
-def test_a_training_view_hides_test_frames(sequence):
-    view = sequence.training_view()
-    assert [frame.index for frame in view.frames("train")] == view.indices("train")
-    assert sequence.frame(1).index == 1 and view.camera(1) == sequence.camera(1) and len(view) == TOTAL
-    with pytest.raises(ValueError, match="got 1, which is held out"):
-        view.frame(1)
-    assert view.validate() == sequence.validate() and view.fingerprint() == sequence.fingerprint()
-
-
 @pytest.mark.parametrize(("option", "named"), [("folder", "rgb"), ("depth_folder", "depth")])
 def test_a_folder_of_folders_names_the_one_to_pass(tiny_sequence, tmp_path, option, named):
     """What `endoprior render` writes, given as a whole."""

@@ -56,7 +56,6 @@ def said(video, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def done(said):
-    """A finished job."""
     return said[0]
 
 

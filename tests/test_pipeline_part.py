@@ -8,8 +8,8 @@ import pytest
 from endoprior.cli.progress import Counting, duration
 from endoprior.pipeline.job import Part, choose_part
 from endoprior.pipeline.steps import every_kth_time, usable_frames
-from endoprior.prepare.frame_selection import FrameSelection
 from endoprior.prepare.video import SourceFrame
+from endoprior.prepare.video_clip import FrameSelection
 
 WHOLE = (0.0, math.inf)
 
@@ -19,30 +19,18 @@ def even(seconds, rate=25.0):
     return [i / rate for i in range(round(seconds * rate))]
 
 
-def test_a_long_video_is_used_to_its_end():
-    part = choose_part(even(300.0), 25.0, 0.0, *WHOLE, most=10_000, usual=300)
-    assert part.is_whole and part.frames_per_second == 12.5 and part.num_frames == 3750
-
-
-def test_a_short_video_is_used_as_it_is():
-    part = choose_part(even(10.0), 25.0, 0.0, *WHOLE, most=300)
-    assert (part.frames_per_second, part.num_frames, part.end, part.is_whole) == (25.0, 250, math.inf, True)
-
-
-def test_a_longer_video_first_loses_frames_in_between():
-    part = choose_part(even(20.0), 25.0, 0.0, *WHOLE, most=300)
-    assert (part.frames_per_second, part.num_frames, part.is_whole) == (12.5, 250, True)
-
-
-def test_a_long_video_then_loses_its_end():
-    part = choose_part(even(300.0), 25.0, 0.0, *WHOLE, most=300)
-    assert (part.frames_per_second, part.num_frames, part.is_whole) == (12.5, 300, False)
-    assert part.end == pytest.approx(299.5 / 12.5)
-
-
-def test_the_choices_of_the_user_stay():
-    part = choose_part(even(300.0), 25.0, 25.0, 10.0, 12.0, most=300)
-    assert (part.frames_per_second, part.start, part.end, part.num_frames) == (25.0, 10.0, 12.0, 50)
+@pytest.mark.parametrize(
+    ("seconds", "chosen", "most", "part"),
+    [
+        (10.0, (0.0, *WHOLE), 300, Part(25.0, 0.0, math.inf, 250, True)),
+        (20.0, (0.0, *WHOLE), 300, Part(12.5, 0.0, math.inf, 250, True)),  # loses frames in between first,
+        (300.0, (0.0, *WHOLE), 300, Part(12.5, 0.0, 299.5 / 12.5, 300, False)),  # then its end
+        (300.0, (0.0, *WHOLE), 10_000, Part(12.5, 0.0, math.inf, 3750, True)),
+        (300.0, (25.0, 10.0, 12.0), 300, Part(25.0, 10.0, 12.0, 50, True)),
+    ],
+)
+def test_a_video_loses_frames_then_its_end_and_choices_stay(seconds, chosen, most, part):
+    assert choose_part(even(seconds), 25.0, *chosen, most=most, usual=300) == part
 
 
 @pytest.mark.parametrize("start", [0.0, 0.5, 1.23])
@@ -99,12 +87,8 @@ def test_progress_says_how_long_the_rest_takes(capsys, monkeypatch):
     now = iter((0.0, 5.0, 20.0, 21.0))
     monkeypatch.setattr("endoprior.cli.progress.clock.monotonic", lambda: next(now))
     with Counting("3/6  train: ") as progress:
-        for what, done, total in (
-            ("training", 0, 300),
-            ("training", 50, 300),
-            ("training", 100, 300),
-            ("packing", 0, 0),
-        ):
-            progress(what, done, total)
+        for done in (0, 50, 100):
+            progress("training", done, 300)
+        progress("packing", 0, 0)
     lines = ["training 0/300", "training 100/300  5.0/s  40 s left", "packing"]
     assert capsys.readouterr().out.splitlines() == [f"3/6  train: {line}" for line in lines]

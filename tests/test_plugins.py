@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -45,18 +46,13 @@ class Truth:
 @pytest.fixture
 def install(tmp_path):
     """Puts a package on the path for the rest of the test."""
-    open_paths = []
+    with ExitStack() as stack:
 
-    def add(groups, name="other-pkg", **modules):
-        site = tmp_path / f"site-{name}"
-        write_package(site, name, groups, **modules)
-        context = on_path(site)
-        context.__enter__()
-        open_paths.append(context)
+        def add(groups, name="other-pkg", **modules):
+            write_package(tmp_path / f"site-{name}", name, groups, **modules)
+            stack.enter_context(on_path(tmp_path / f"site-{name}"))
 
-    yield add
-    for context in reversed(open_paths):
-        context.__exit__(None, None, None)
+        yield add
 
 
 def problems(capsys) -> list[str]:
@@ -64,29 +60,29 @@ def problems(capsys) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("registry", "kind", "source", "said"),
+    ("registry", "source", "said"),
     [
-        (DATASETS, "datasets", "import absent_library", "ModuleNotFoundError: No module named 'absent_library'"),
-        (DATASETS, "datasets", "x = (", "SyntaxError"),
-        (DATASETS, "datasets", "raise SystemExit(3)", "SystemExit: 3"),
-        (DATASETS, "datasets", "", "expected a Format of endoprior.data.formats, got an object of type module"),
-        (EXPORTERS, "exporters", "", "expected a Format of endoprior.export.formats, got an object of type module"),
-        (METHODS, "methods", "options = {}\ndef train(): pass", "got options of type dict"),
-        (METHODS, "methods", "from endoprior import Config\noptions = Config()", "got no function train"),
-        (SCORES, "scores", "", "got SCORES of type NoneType"),
-        (SCORES, "scores", GOOD_SCORE.replace("compute", "run"), "got no function compute"),
-        (SCORES, "scores", GOOD_SCORE.replace('"extra"', '"psnr"'), "got another score psnr, which is built in"),
+        (DATASETS, "import absent_library", "ModuleNotFoundError: No module named 'absent_library'"),
+        (DATASETS, "x = (", "SyntaxError"),
+        (DATASETS, "raise SystemExit(3)", "SystemExit: 3"),
+        (DATASETS, "", "expected a Format of endoprior.data.formats, got an object of type module"),
+        (EXPORTERS, "", "expected a Format of endoprior.export.formats, got an object of type module"),
+        (METHODS, "options = {}\ndef train(): pass", "got options of type dict"),
+        (METHODS, "from endoprior import Config\noptions = Config()", "got no function train"),
+        (SCORES, "", "got SCORES of type NoneType"),
+        (SCORES, GOOD_SCORE.replace("compute", "run"), "got no function compute"),
+        (SCORES, GOOD_SCORE.replace('"extra"', '"psnr"'), "got another score psnr, which is built in"),
     ],
 )
-def test_a_plugin_that_is_not_what_it_promises_is_named(install, capsys, registry, kind, source, said):
-    install({kind: {"mine": "bad_module"}}, bad_module=source)
+def test_a_plugin_that_is_not_what_it_promises_is_named(install, capsys, registry, source, said):
+    install({registry.kind: {"mine": "bad_module"}}, bad_module=source)
     assert registry.names() == (*registry.builtin, "mine")
     with pytest.raises(InputError, match=r"^plugin mine of other-pkg 1\.0 \(bad_module\): expected ") as caught:
         registry.load("mine")
     assert said in str(caught.value) and "\n" not in str(caught.value)
     assert main(["plugins"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if " mine " in line]
-    assert line.startswith(kind) and "other-pkg 1.0" in line and said in line
+    assert line.startswith(registry.kind) and "other-pkg 1.0" in line and said in line
 
 
 @pytest.mark.parametrize(
@@ -105,23 +101,11 @@ def test_the_place_in_the_plugins_own_code_is_named(install, tmp_path, bad, plac
     assert f"({tmp_path / 'site-other-pkg' / place}). Fix: Update" in str(caught.value)
 
 
-def test_a_missing_object_is_named(install):
-    install({"datasets": {"mine": "good_module:ABSENT"}}, good_module="")
-    with pytest.raises(InputError, match=r"has no attribute 'ABSENT'\. Fix: Update or uninstall other-pkg"):
-        DATASETS.load("mine")
-
-
 @pytest.mark.parametrize(
-    ("registry", "kind", "name"),
-    [
-        (DATASETS, "datasets", "endonerf"),
-        (DATASETS, "datasets", "auto"),
-        (METHODS, "methods", "endogs"),
-        (PRESETS, "presets", "default"),
-    ],
+    ("registry", "name"), [(DATASETS, "endonerf"), (DATASETS, "auto"), (METHODS, "endogs"), (PRESETS, "default")]
 )
-def test_built_in_names_stay_built_in(install, capsys, registry, kind, name):
-    install({kind: {name: "bad_module"}}, bad_module="raise RuntimeError('imported')")
+def test_built_in_names_stay_built_in(install, capsys, registry, name):
+    install({registry.kind: {name: "bad_module"}}, bad_module="raise RuntimeError('imported')")
     assert registry.names() == registry.builtin and {used for used, _ in registry.usable()} <= {*registry.builtin}
     (line,) = problems(capsys)  # reported once, though asked twice
     assert f"plugin {name} of other-pkg 1.0" in line and "got that of a built-in one" in line
@@ -176,10 +160,12 @@ FORMAT = Format(lambda path: 1 / 0, None)
 
 
 def test_scores_of_a_plugin_are_computed_and_known(install, tiny_sequence):
-    install({"scores": {"mine": "good_module"}}, good_module=GOOD_SCORE)
+    install({"scores": {"mine": "good_module"}, "datasets": {"mine": "good_module:ABSENT"}}, good_module=GOOD_SCORE)
     sequence = load_sequence(tiny_sequence)
     assert evaluate(Truth(sequence), sequence, networks=False).scores["extra"] == 7
     assert all_scores()["extra"].label == "extra"
+    with pytest.raises(InputError, match=r"has no attribute 'ABSENT'\. Fix: Update or uninstall other-pkg"):
+        DATASETS.load("mine")
 
 
 def test_typos_list_the_plugins(install, capsys, tiny_sequence):

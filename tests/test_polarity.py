@@ -19,30 +19,24 @@ def scene(tool_color=(120, 120, 125), tissue_color=(190, 90, 85), columns=20, se
     return tool, np.clip(image, 0, 255).astype(np.uint8)
 
 
+near_lens = np.zeros((HEIGHT, WIDTH), bool)
+near_lens[:, : int(0.65 * WIDTH)] = True  # a tool close to the lens
+
+
+@pytest.mark.parametrize(
+    ("made", "least", "most"),
+    [
+        (scene(), 0.95, 1),
+        ((near_lens, np.where(near_lens[..., None], (110, 110, 112), (190, 90, 85)).astype(np.uint8)), 0.8, 1),
+        (scene(tool_color=(150, 100, 100), tissue_color=(150, 100, 100)), 0.3, 0.95),
+    ],
+    ids=["gray and small", "color outweighs area", "area alone"],
+)
 @pytest.mark.parametrize("inverted", [False, True])
-def test_the_gray_region_is_the_tool(inverted):
-    tool, image = scene()
+def test_the_tool_is_found_in_both_polarities(made, least, most, inverted):
+    tool, image = made
     found = mask_polarity([tool ^ inverted] * 3, [image] * 3)
-    assert found.tool_is_high != inverted
-    assert found.certainty > 0.95
-    assert "\n" not in found.reason and f"{1 - tool.mean() if inverted else tool.mean():.0%}"[0] in found.reason
-
-
-@pytest.mark.parametrize("inverted", [False, True])
-def test_color_outweighs_area(inverted):
-    tool = np.zeros((HEIGHT, WIDTH), bool)
-    tool[:, : int(0.65 * WIDTH)] = True  # a tool close to the lens
-    image = np.where(tool[..., None], (110, 110, 112), (190, 90, 85)).astype(np.uint8)
-    found = mask_polarity([tool ^ inverted], [image])
-    assert found.tool_is_high != inverted and found.certainty > 0.8
-
-
-@pytest.mark.parametrize("inverted", [False, True])
-def test_area_decides_without_color(inverted):
-    tool, image = scene(tool_color=(150, 100, 100), tissue_color=(150, 100, 100))
-    found = mask_polarity([tool ^ inverted], [image])
-    assert found.tool_is_high != inverted
-    assert 0.3 < found.certainty < 0.95
+    assert found.tool_is_high != inverted and least < found.certainty <= most and "\n" not in found.reason
 
 
 def test_ambiguous_masks_have_low_certainty():

@@ -46,6 +46,18 @@ def relative(tmp_path_factory):
     return write(tmp_path_factory.mktemp("relative") / "DATA", True)
 
 
+@pytest.fixture
+def folder(metric, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(metric, tmp_path / "DATA")
+
+
+def depth_ratios(folder):
+    """(T,) median stored depth over that which the camera truly sees."""
+    stored = [decode_image(file, None).astype(float) * 0.01 for file in sorted((folder / "depth").glob("*.png"))]
+    return np.array([np.median(d / view(p).depth) for d, p in zip(stored, TRUE, strict=True)])
+
+
 def poses_of(folder):
     return np.load(folder / "poses_bounds.npy")[:, :15].reshape(-1, 3, 5)
 
@@ -54,8 +66,7 @@ def described(folder):
     return json.loads((folder / "sequence.json").read_text())
 
 
-def test_poses_are_found_and_the_originals_kept(metric, tmp_path, capsys):
-    folder = shutil.copytree(metric, tmp_path / "DATA")
+def test_poses_are_found_and_the_originals_kept(metric, folder, capsys):
     assert main(["poses", str(folder), "--poses", "own"]) == 0
     said = capsys.readouterr().out
     assert "against the true path" in said and "aligned by SE(3)" in said and "poses_bounds_before.npy" in said
@@ -78,22 +89,15 @@ def test_poses_are_found_and_the_originals_kept(metric, tmp_path, capsys):
     assert (folder / "poses_bounds_before.npy").read_bytes() == (metric / "poses_bounds.npy").read_bytes()
 
 
-def test_relative_depth_is_brought_to_the_path_also_twice(relative, tmp_path, capsys):
+def test_relative_depth_is_brought_to_the_path_also_twice(relative, tmp_path):
     folder = shutil.copytree(relative, tmp_path / "DATA")
-
-    def ratio():
-        """(T,) median stored depth over that which the camera truly sees."""
-        files = sorted((folder / "depth").glob("*.png"))
-        stored = [decode_image(file, None).astype(float) * 0.01 for file in files]
-        return np.array([np.median(d / view(p).depth) for d, p in zip(stored, TRUE, strict=True)])
-
-    assert np.ptp(ratio()) > 0.5
+    assert np.ptp(depth_ratios(folder)) > 0.5
     assert main(["poses", str(folder), "--poses", "own"]) == 0
-    once = ratio()
+    once = depth_ratios(folder)
     assert np.ptp(once) / once.mean() < 0.03
     reach = np.linalg.norm(poses_of(folder)[:, :, 3], axis=1).max()
     assert main(["poses", str(folder), "--poses", "own"]) == 0
-    twice = ratio()
+    twice = depth_ratios(folder)
     assert np.ptp(twice) / twice.mean() < 0.03 and twice.mean() == pytest.approx(once.mean(), rel=0.05)
     assert np.linalg.norm(poses_of(folder)[:, :, 3], axis=1).max() == pytest.approx(reach, rel=0.1)
     assert not list(folder.glob(".*"))
@@ -103,39 +107,30 @@ def test_given_poses_scale_relative_depth(relative, tmp_path):
     folder = shutil.copytree(relative, tmp_path / "DATA")
     np.save(tmp_path / "true.npy", TRUE)
     assert main(["poses", str(folder), "--poses", str(tmp_path / "true.npy")]) == 0
-    files = sorted((folder / "depth").glob("*.png"))
-    stored = [decode_image(file, None).astype(float) * 0.01 for file in files]
-    assert np.allclose([np.median(d / view(p).depth) for d, p in zip(stored, TRUE, strict=True)], 1, atol=0.03)
+    assert np.allclose(depth_ratios(folder), 1, atol=0.03)
     assert np.allclose(poses_of(folder)[:, :, :4], TRUE[:, :3])
     assert described(folder)["sources"]["poses"] == "file"
 
 
 @pytest.mark.parametrize(("source", "kept"), [("file", True), ("SLAM", True), ("COLMAP", False)])
-def test_only_estimated_poses_are_replaced_without_a_copy(metric, tmp_path, source, kept):
-    folder = shutil.copytree(metric, tmp_path / "DATA")
+def test_only_estimated_poses_are_replaced_without_a_copy(folder, source, kept):
     facts = described(folder)
     (folder / "sequence.json").write_text(json.dumps(facts | {"sources": facts["sources"] | {"poses": source}}))
     assert main(["poses", str(folder), "--poses", "still"]) == 0
     assert (folder / "poses_bounds_before.npy").exists() == kept
+    assert np.allclose(poses_of(folder)[:, :, :4], np.eye(4)[:3])
+    assert described(folder)["sources"]["poses"] == "static camera" and not (folder / "camera_path.json").exists()
 
 
-def test_a_folder_without_poses(metric, tmp_path):
-    folder = shutil.copytree(metric, tmp_path / "DATA")
+def test_a_folder_without_poses(folder):
     (folder / "poses_bounds.npy").unlink()
     assert main(["poses", str(folder), "--poses", "own"]) == 0
     assert len(load_sequence(folder, DataConfig())) == COUNT and not (folder / "poses_bounds_before.npy").exists()
 
 
-def test_a_static_camera_is_written_as_such(metric, tmp_path):
-    folder = shutil.copytree(metric, tmp_path / "DATA")
-    assert main(["poses", str(folder), "--poses", "still"]) == 0
-    assert np.allclose(poses_of(folder)[:, :, :4], np.eye(4)[:3])
-    assert described(folder)["sources"]["poses"] == "static camera" and not (folder / "camera_path.json").exists()
-
-
 @pytest.mark.parametrize("kind", ["no depth", "no focal", "missing file", "wrong count", "read-only"])
-def test_bad_input_gives_one_line_and_changes_nothing(metric, tmp_path, kind, capsys, monkeypatch):
-    folder, options = shutil.copytree(metric, tmp_path / "DATA"), ["--poses", "own"]
+def test_bad_input_gives_one_line_and_changes_nothing(folder, tmp_path, kind, capsys, monkeypatch):
+    options = ["--poses", "own"]
     if kind == "no depth":
         shutil.rmtree(folder / "depth")
     elif kind == "no focal":

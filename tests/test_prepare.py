@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from video_files import write_video
 
-from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.prepare import PrepareConfig, prepare, work_folder
+from endoprior.prepare import PrepareConfig, prepare
 
 FRAMES, WIDTH, HEIGHT = 5, 256, 192
 
@@ -33,6 +32,11 @@ def cameras(phantom):
 
 def options(phantom, **changed):
     return PrepareConfig(**({"calibration": phantom / "calibration.json", "masks": str(phantom / "masks")} | changed))
+
+
+def pairs(done, phantom):
+    """The frames of a prepared folder, each with that of the phantom."""
+    return zip(load_sequence(done.out).frames("video"), load_sequence(phantom).frames("video"), strict=True)
 
 
 def depth_error(folder, phantom):
@@ -59,12 +63,10 @@ LAYOUTS = {
 }
 
 
-SLOW = pytest.mark.slow
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("top-bottom", "interlaced")]
 
 
-@pytest.mark.parametrize(
-    "layout", ["side-by-side", *(pytest.param(name, marks=SLOW) for name in ("top-bottom", "interlaced"))]
-)
+@pytest.mark.parametrize("layout", ["side-by-side", *SLOW])
 def test_a_stereo_video_becomes_a_sequence(tmp_path, phantom, layout):
     frames = [LAYOUTS[layout](*pair) for pair in zip(*cameras(phantom), strict=True)]
     video = write_video(tmp_path / "v.mp4", frames, rate=15)
@@ -75,7 +77,7 @@ def test_a_stereo_video_becomes_a_sequence(tmp_path, phantom, layout):
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (true.fx, true.fy, true.cx, true.cy)
     error, share = depth_error(done.out, phantom)
     assert error < (1.0 if layout != "interlaced" else 2.0) and share > 0.8  # half of the rows are made up
-    for frame, original in zip(sequence.frames("video"), load_sequence(phantom).frames("video"), strict=True):
+    for frame, original in pairs(done, phantom):
         assert np.array_equal(frame.tissue_mask, original.tissue_mask)
         if layout != "interlaced":
             assert np.abs(frame.rgb_u8.astype(int) - original.rgb_u8).mean() < 2  # H.264
@@ -101,8 +103,7 @@ def test_monocular_video_without_options(tmp_path, phantom):
     tissue = [frame.depth[frame.tissue_mask] for frame in sequence.frames("video")]
     assert np.median(np.concatenate(tissue)) == pytest.approx(70, rel=0.1)
     text = " ".join(done.notes)
-    assert "no calibration" in text and "relative (shading)" in text and "static" in text
-    assert "70 mm" not in text
+    assert "no calibration" in text and "relative (shading)" in text and "static" in text and "70 mm" not in text
     assert sequence.validate() is not None
 
 
@@ -116,14 +117,13 @@ def test_depth_files_with_a_unit(tmp_path, phantom, kind):
             np.save(file, np.where(frame.depth_valid, meters, np.nan))
         else:
             cv2.imwrite(str(file), np.round(frame.depth * 100).astype(np.uint16) if kind == "png" else meters)
-    cfg = options(
-        phantom, depth=str(tmp_path / "depth"), depth_unit_mm=0.01 if kind == "png" else 1000.0, layout="mono"
-    )
+    given = {"depth": str(tmp_path / "depth"), "layout": "mono"}
+    cfg = options(phantom, **given, depth_unit_mm=0.01 if kind == "png" else 1000.0)
     done = prepare(phantom / "images", tmp_path / "out", cfg)
-    for mine, true in zip(load_sequence(done.out).frames("video"), load_sequence(phantom).frames("video"), strict=True):
+    for mine, true in pairs(done, phantom):
         assert np.abs(mine.depth - true.depth).max() < 0.02 and np.array_equal(mine.depth_valid, true.depth_valid)
     with pytest.raises(InputError, match="--depth-unit-mm: expected mm per unit of the files in"):
-        prepare(phantom / "images", tmp_path / "no", options(phantom, depth=str(tmp_path / "depth"), layout="mono"))
+        prepare(phantom / "images", tmp_path / "no", options(phantom, **given))
 
 
 def test_depth_in_another_unit_than_declared(tmp_path, phantom):
@@ -172,7 +172,7 @@ def test_inverted_masks_are_corrected(tmp_path, phantom):
     cfg = options(phantom, masks=str(tmp_path / "masks"), layout="mono")
     done = prepare(phantom / "images", tmp_path / "out", cfg)
     assert any("low values mark tools" in remark for remark in done.notes)
-    for mine, true in zip(load_sequence(done.out).frames("video"), load_sequence(phantom).frames("video"), strict=True):
+    for mine, true in pairs(done, phantom):
         assert np.array_equal(mine.tissue_mask, true.tissue_mask)
 
 
@@ -218,13 +218,18 @@ def test_an_interrupted_run_resumes_with_identical_files(tmp_path, phantom):
 
     with pytest.raises(KeyboardInterrupt):
         prepare(phantom / "images", tmp_path / "out", cfg, stop)
-    assert not (tmp_path / "out").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".out.endoprior.preparing", "want"]
     written = []
     done = prepare(phantom / "images", tmp_path / "out", cfg, lambda what, done, total: written.append((what, done)))
     assert ("writing frames", 3) in written and ("writing frames", 2) not in written
     names = sorted(path.relative_to(want) for path in want.rglob("*") if path.is_file())
     assert names == sorted(path.relative_to(done.out) for path in done.out.rglob("*") if path.is_file())
     assert all((want / name).read_bytes() == (done.out / name).read_bytes() for name in names)
+
+
+def empty(folder):
+    (folder / "v.mp4").touch()
+    return folder / "v.mp4"
 
 
 def cut_short(folder, phantom):
@@ -247,76 +252,39 @@ def without(folder, phantom, key):
     return folder / "c.json"
 
 
+MONO = {"layout": "mono"}
 BAD = {
-    "zero-length video": lambda d, p: ((d / "v.mp4").touch(), d / "v.mp4", {}, "an empty file")[1:],
-    "truncated video": lambda d, p: (cut_short(d, p), {"layout": "side-by-side"}, "--end"),
-    "no such video": lambda d, p: (d / "no.mp4", {}, "no such file"),
-    "swapped cameras": lambda d, p: (p / "right", {"right": p / "images"}, "--swap-eyes"),
-    "missing calibration key": lambda d, p: (
-        p / "images",
-        {"right": p / "right", "calibration": without(d, p, "R")},
-        "no R",
-    ),
-    "second camera missing": lambda d, p: (p / "images", {"layout": "two-files"}, "--right"),
-    "sgbm with one camera": lambda d, p: (p / "images", {"layout": "mono", "depth": "sgbm"}, "expected two cameras"),
-    "mask of another size": lambda d, p: (
-        p / "images",
-        {"layout": "mono", "masks": str(smaller_masks(d, p))},
-        "px like the images",
-    ),
-    "no mask folder": lambda d, p: (p / "images", {"layout": "mono", "masks": "nowhere"}, "a folder of masks"),
-    "no depth folder": lambda d, p: (p / "images", {"layout": "mono", "depth": "nowhere"}, "a folder of depth"),
-    "too many frames": lambda d, p: (p / "images", {"layout": "mono", "max_frames": 3}, "at most 3 frames"),
-    "nothing selected": lambda d, p: (p / "images", {"layout": "mono", "start": 9.0}, "at least 2 frames"),
-    "relative what": lambda d, p: (
-        p / "images",
-        {"layout": "mono", "depth_relative": "depth"},
-        "a folder with --depth",
-    ),
-    "no poses": lambda d, p: (p / "images", {"layout": "mono", "poses": "nowhere.npy"}, "camera poses"),
+    "missing calibration key": lambda d, p: ({"right": p / "right", "calibration": without(d, p, "R")}, "no R"),
+    "second camera missing": lambda d, p: ({"layout": "two-files"}, "--right"),
+    "sgbm with one camera": lambda d, p: (MONO | {"depth": "sgbm"}, "expected two cameras"),
+    "mask of another size": lambda d, p: (MONO | {"masks": str(smaller_masks(d, p))}, "px like the images"),
+    "no mask folder": lambda d, p: (MONO | {"masks": "nowhere"}, "a folder of masks"),
+    "no depth folder": lambda d, p: (MONO | {"depth": "nowhere"}, "a folder of depth"),
+    "too many frames": lambda d, p: (MONO | {"max_frames": 3}, "at most 3 frames"),
+    "nothing selected": lambda d, p: (MONO | {"start": 9.0}, "at least 2 frames"),
+    "relative what": lambda d, p: (MONO | {"depth_relative": "depth"}, "a folder with --depth"),
+    "no poses": lambda d, p: (MONO | {"poses": "nowhere.npy"}, "camera poses"),
     "blank outside": lambda d, p: (
-        p / "images",
-        {"layout": "mono", "blank": ("0,0,9,9", "250,0,9,9")},
-        "--blank: expected a rectangle within 256x192 px, got 250,0,9,9",
+        MONO | {"blank": ("0,0,9,9", "250,0,9,9")}, "--blank: expected a rectangle within 256x192 px, got 250,0,9,9",
     ),
-    "crop outside": lambda d, p: (p / "images", {"layout": "mono", "crop": "0,0,999,9"}, "--crop"),
-    "calibration of another camera": lambda d, p: (p / "images", {"layout": "side-by-side"}, "the same aspect ratio"),
-}
+    "crop outside": lambda d, p: (MONO | {"crop": "0,0,999,9"}, "--crop"),
+    "calibration of another camera": lambda d, p: ({"layout": "side-by-side"}, "the same aspect ratio"),
+    "swapped cameras": lambda d, p: ({"right": p / "images"}, "--swap-eyes", p / "right"),
+    "zero-length video": lambda d, p: ({}, "an empty file", empty(d)),
+    "truncated video": lambda d, p: ({"layout": "side-by-side"}, "--end", cut_short(d, p)),
+    "no such video": lambda d, p: ({}, "no such file", d / "no.mp4"),
+}  # fmt: skip
+"""Options, what is said, and the video, if it is not the images of the phantom."""
 
 
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_input_gives_one_line_and_leaves_nothing(tmp_path, phantom, kind):
-    video, changed, says = BAD[kind](tmp_path, phantom)
+    changed, says, *video = BAD[kind](tmp_path, phantom)
     before = sorted(tmp_path.iterdir())
     with pytest.raises(InputError) as error:
-        prepare(video, tmp_path / "out", options(phantom, **changed))
+        prepare(*video or [phantom / "images"], tmp_path / "out", options(phantom, **changed))
     assert says in str(error.value) and "\n" not in str(error.value)
     assert sorted(tmp_path.iterdir()) == before
-
-
-@pytest.mark.slow
-def test_the_command(tmp_path, phantom, capsys):
-    frames = [np.vstack(pair) for pair in zip(*cameras(phantom), strict=True)]
-    video = write_video(tmp_path / "v.mp4", frames, rate=15)
-    calibration = str(phantom / "calibration.json")
-    assert main(["prepare", str(video), str(tmp_path / "out"), "--calibration", calibration]) == 0
-    said = capsys.readouterr().out
-    assert f"{FRAMES} frames of {WIDTH}x{HEIGHT}" in said and "note: masks: tools found in" in said
-    assert main(["check", str(tmp_path / "out"), "--out", str(tmp_path / "check.png")]) == 0
-    assert main(["prepare", str(video), str(tmp_path / "out"), "--calibration", calibration]) == 2
-    assert "expected a new or empty folder" in capsys.readouterr().err
-    assert main(["prepare", str(video), str(tmp_path / "new"), "--end", "-1"]) == 2
-
-
-def test_an_interruption_leaves_only_the_hidden_folder(tmp_path, phantom):
-    def stop(what, done, total):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        prepare(phantom / "images", tmp_path / "out", options(phantom, layout="mono"), stop)
-    assert [path.name for path in tmp_path.iterdir()] == [".out.endoprior.preparing"]
-    assert (tmp_path / ".out.endoprior.preparing" / work_folder.PLAN).exists()
-    shutil.rmtree(tmp_path / ".out.endoprior.preparing")
 
 
 @pytest.mark.slow

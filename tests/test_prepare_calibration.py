@@ -102,11 +102,8 @@ def test_the_row_offset_is_measured_and_undone(tmp_path, capsys):
     assert prepare(tmp_path, video, calibrated, "--keep-right", "--row-offset", "auto") == 0
     assert "moved up by 5.00 px: the rows of both cameras were 5.00 px apart, now 0.00" in capsys.readouterr().out
     assert depth_of(tmp_path / "DATA")[1] > 0.95 > 0.6 > before and "vertical-offset" not in codes(tmp_path / "DATA")
-
-
-def test_a_row_offset_needs_two_cameras(tmp_path, capsys):
-    video = write_video(tmp_path / "v.mkv", [left for left, _ in PAIRS])
-    assert main(["prepare", str(video), str(tmp_path / "DATA"), "--row-offset", "auto", *QUICK]) == 2
+    mono = str(write_video(tmp_path / "m.mkv", [left for left, _ in PAIRS]))
+    assert main(["prepare", mono, str(tmp_path / "M"), "--row-offset", "auto", *QUICK]) == 2
     assert "--row-offset: expected two cameras, got one camera" in capsys.readouterr().err
 
 
@@ -147,9 +144,8 @@ def test_squeezed_eyes_of_pixels_that_are_not_square(tmp_path, capsys, of_stored
 def test_a_row_offset_of_squeezed_eyes(tmp_path, capsys):
     video = side_by_side(tmp_path / "v.mkv", squeezed=True, low=5)
     calibrated = calibration(tmp_path / "c.json", width=WIDTH, height=HEIGHT)
-    assert (
-        prepare(tmp_path, video, calibrated, "--squeezed-eyes", "--layout", "side-by-side", "--row-offset", "auto") == 0
-    )
+    words = "--squeezed-eyes", "--layout", "side-by-side", "--row-offset", "auto"
+    assert prepare(tmp_path, video, calibrated, *words) == 0
     assert "moved up by 5.0" in capsys.readouterr().out and depth_of(tmp_path / "DATA")[1] > 0.9
 
 

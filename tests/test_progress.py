@@ -14,7 +14,7 @@ from tiny_training import tiny_config
 from endoprior.data import load_sequence
 from endoprior.runs.progress import training_progress
 from endoprior.runs.train import train
-from endoprior.training.stage import Stage
+from endoprior.training.trainer import Stage
 
 
 class Terminal(io.StringIO):

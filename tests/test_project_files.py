@@ -83,7 +83,14 @@ def test_every_yaml_file_of_the_project_can_be_read():
     assert all(yaml.safe_load(file.read_text()) for file in hidden)
 
 
-def test_opencv_reads_and_writes_no_video():
-    """Its wheel holds an FFmpeg with protocols, and OpenSSL 1.1.1k."""
-    for path in (ROOT / "src").rglob("*.py"):
-        assert not re.search("VideoCapture|VideoWriter|CAP_FFMPEG", path.read_text()), path
+def test_the_workflow_runs_what_it_names():
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8"))
+    job = workflow["jobs"]["test"]
+    assert {name.split("-")[0] for name in job["strategy"]["matrix"]["os"]} == {"ubuntu", "macos", "windows"}
+    oldest = re.search(r'requires-python = ">=([\d.]+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8"))[1]
+    assert oldest in job["strategy"]["matrix"]["python"]
+    steps = "\n".join(step.get("run", "") for step in job["steps"])
+    assert "make" not in steps  # Windows has none
+    for word in ("-c constraints.txt", "pytest -n 2 --dist loadfile"):
+        assert word in steps
+    assert workflow["jobs"]["lint"]["steps"][-1]["run"] == "make lint"

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.model.motion import RankOneGradient
-from endoprior.training import adam_numba
 from endoprior.training.adam import BETA1, BETA2, AdamState
+from endoprior.training.ops import NUMBA
 
 LONGEST_STEP = (1 - BETA1) / np.sqrt(1 - BETA2) / np.sqrt(1 - BETA1**2 / BETA2)
 """In learning rates: 7.3, by Cauchy and Schwarz over all sequences of gradients; test_divergence.py comes close."""
@@ -32,7 +32,7 @@ def test_a_step_is_finite_and_never_longer_than_it_can_be(seed, num, steps, epsi
     for _ in range(steps):
         before = param.detach().clone()
         param.grad = torch.from_numpy(gradients(rng, num))
-        adam_numba.adam_step([state], [param], rate, epsilon)
+        NUMBA.adam_step([state], [param], rate, epsilon)
         assert torch.isfinite(param).all() and torch.isfinite(state.first).all() and torch.isfinite(state.second).all()
         assert ((param.detach() - before).abs() <= 1.001 * LONGEST_STEP * rate + 1e-6).all()
 
@@ -48,10 +48,10 @@ def test_a_step_along_a_basis_is_that_of_the_whole_gradient(seed, num, bases, mo
     state, plain = AdamState(outer, bases), AdamState(flat)
     found = [RankOneGradient(w, torch.from_numpy(v)) for w, v in zip(weights, offsets, strict=True)]
     for _ in range(3):
-        adam_numba.adam_basis_step(state, outer, found, np.full(3, 1e-2), 1e-15)
+        NUMBA.adam_basis_step(state, outer, found, np.full(3, 1e-2), 1e-15)
         whole = sum(np.einsum("b,nc->nbc", w, v) for w, v in zip(weights, offsets, strict=True))
         flat.grad = torch.from_numpy(whole)
-        adam_numba.adam_step([plain], [flat], 1e-2, 1e-15)
+        NUMBA.adam_step([plain], [flat], 1e-2, 1e-15)
     assert (outer[:, -1] == 0).all() and torch.isfinite(outer).all()
     # Sums of either sign may cancel: then the rounding decides the direction of Adam's first steps.
     clear = np.abs(whole) > 1e-3 * np.abs(whole).max()

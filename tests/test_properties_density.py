@@ -18,7 +18,7 @@ from endoprior.core.config import DensityConfig, ReleasedMethod
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.presets import preset
-from endoprior.training import density, density_numba
+from endoprior.training import density
 from endoprior.training.density import DensityStats, apply_plan
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer, rate_of
@@ -115,14 +115,14 @@ def test_scores_stay_within_the_prior(seed, height, width, num, level, scale):
     out = RenderOutput(EMPTY, EMPTY, EMPTY, torch.tensor(means2d, dtype=torch.float32), radii)
     mask, prior = torch.tensor(rng.random((height, width)) < 0.6), torch.full((height, width), level)
     stats = DensityStats.zeros(num)
-    density_numba.add_score(stats, out, prior, mask, torch.full((num,), 0.5), scale)
+    NUMBA.add_score(stats, out, prior, mask, torch.full((num,), 0.5), scale)
     valid = stats.num_valid > 0
     assert not valid[radii == 0].any() and (mask.any() or not valid.any())
     inside = torch.tensor(((means2d * scale >= 0) & (means2d * scale <= [width, height])).all(-1))
     assert not valid[~inside].any()
     assert stats.score(0.0)[valid].numpy() == pytest.approx(level, abs=2e-6)
     if scale == 1.0:
-        assert torch.equal(density_numba.valid_projection(out.means2d, radii, mask), valid)
+        assert torch.equal(NUMBA.valid_projection(out.means2d, radii, mask), valid)
 
 
 @given(SEEDS, st.integers(0, 20))
@@ -133,7 +133,7 @@ def test_gradients_of_what_was_not_drawn_are_not_looked_at(seed, num):
     means2d.grad = torch.tensor(rng.normal(size=(num, 2)), dtype=torch.float32)
     means2d.grad[radii == 0] = math.nan
     stats = DensityStats.zeros(num)
-    density_numba.add_gradient(stats, RenderOutput(EMPTY, EMPTY, EMPTY, means2d, radii), 40, 30)
+    NUMBA.add_gradient(stats, RenderOutput(EMPTY, EMPTY, EMPTY, means2d, radii), 40, 30)
     assert torch.isfinite(stats.grad2d_ndc_sum).all() and torch.equal(stats.num_seen, radii.float())
 
 

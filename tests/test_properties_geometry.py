@@ -18,7 +18,7 @@ from endoprior.core.geometry import back_project, bilinear, expected_depth, pixe
 from endoprior.data.pixels import shrunk_camera
 from endoprior.model import motion
 from endoprior.model.motion import basis_weights
-from endoprior.training.temporal_numba import neighbors
+from endoprior.training.local_motion import neighbors_numba as neighbors
 
 SEEDS = st.integers(0, 2**31 - 1)
 SIDES = st.integers(1, 60)

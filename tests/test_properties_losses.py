@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.core.config import TemporalConfig
-from endoprior.training import losses, temporal, temporal_numba
-from endoprior.training.losses_numba import supervised_losses
+from endoprior.training import local_motion, losses, temporal
+from endoprior.training.local_motion import affinity_numba, local_motion_numba, neighbors_numba
+from endoprior.training.losses import supervised_losses_numba as supervised_losses
 
 
 @st.composite
@@ -77,7 +78,7 @@ def test_a_perfect_picture_of_one_color_costs_nothing(made):
 def with_torch(now, before, indices, pair_weights, smooth_l1):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal.local_motion(now, before, indices, pair_weights, smooth_l1)
+    return local_motion.local_motion(now, before, indices, pair_weights, smooth_l1)
 
 
 @st.composite
@@ -100,16 +101,16 @@ def clouds(draw):
 def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, smooth_l1, seed):
     if k >= len(points):
         with pytest.raises(ValueError, match="k must be in"):
-            temporal_numba.neighbors(points, k)
+            neighbors_numba(points, k)
         return
-    indices, distances = temporal_numba.neighbors(points, k)
+    indices, distances = neighbors_numba(points, k)
     weights = np.random.default_rng(seed).random(len(points))
-    pair_weights = temporal_numba.affinity(distances, indices, weights)
+    pair_weights = affinity_numba(distances, indices, weights)
     assert np.isfinite(pair_weights).all() and (pair_weights >= 1e-8).all()
     scale = np.abs(points).max()
     moved = points + np.random.default_rng(seed).normal(size=points.shape) * 0.1 * scale
     results = []
-    for function in (temporal_numba.local_motion, with_torch):
+    for function in (local_motion_numba, with_torch):
         now, before = (torch.tensor(p).requires_grad_() for p in (moved, points))
         terms = function(now, before, indices, pair_weights, smooth_l1)
         sum(terms).backward()
@@ -124,17 +125,17 @@ def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, smoot
 def test_what_moves_as_one_costs_nothing(points, seed):
     """Eq. (11): a common translation has no displacement part but its floor, a rigid motion no distance part."""
     k = min(4, len(points) - 1)
-    indices, distances = temporal_numba.neighbors(points, k)
-    pair_weights = temporal_numba.affinity(distances, indices, np.ones(len(points)))
+    indices, distances = neighbors_numba(points, k)
+    pair_weights = affinity_numba(distances, indices, np.ones(len(points)))
     size = np.abs(points).max()
     shift = np.random.default_rng(seed).normal(size=3) * size
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     before = torch.tensor(points)
-    displacement, distance = temporal_numba.local_motion(before + torch.tensor(shift), before, indices, pair_weights)
+    displacement, distance = local_motion_numba(before + torch.tensor(shift), before, indices, pair_weights)
     assert displacement == pytest.approx(1e-4, abs=1e-6 + 1e-9 * size)
     turned = torch.tensor(points @ turn.T + shift)
     assert distance < 1e-9 * (1 + size)
-    assert temporal_numba.local_motion(turned, before, indices, pair_weights)[1] < 1e-9 * (1 + size)
+    assert local_motion_numba(turned, before, indices, pair_weights)[1] < 1e-9 * (1 + size)
 
 
 @given(SEEDS, st.integers(0, 300), st.integers(1, 100), st.sampled_from([0.0, -300.0, 30.0]))

@@ -26,7 +26,7 @@ from endoprior.runs.train import start_run, train
 from endoprior.system.arrays_file import load_arrays, save_arrays
 from endoprior.training import divergence
 from endoprior.training.divergence import Diverged
-from endoprior.training.stage import Stage
+from endoprior.training.trainer import Stage
 from endoprior_baselines.radiance import presets as presets_radiance
 from endoprior_baselines.radiance.endonerf import EndoNeRF, depth_spread
 from endoprior_baselines.radiance.endosurf import EndoSurf, enclosing_sphere, without_outliers

@@ -140,12 +140,9 @@ def test_ray_that_is_not_installed(tiny_sequence, tmp_path, capsys, monkeypatch)
     monkeypatch.setitem(sys.modules, "ray", None)
     assert main(["train", str(tiny_sequence), str(tmp_path / "out"), "--ray", "local"]) == 2
     assert "--ray: expected Ray, got none. Fix: `pip install" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_live_view_needs_a_training_in_this_process(tiny_sequence, tmp_path, capsys):
     assert main(["train", str(tiny_sequence), str(tmp_path / "out"), "--ray", "local", "--view"]) == 2
     assert "--view: expected a training in this process" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_signal_that_ray_swallowed_still_interrupts():

@@ -24,8 +24,7 @@ from endoprior.core.config import Config, DataConfig
 from endoprior.core.config_io import to_dict
 from endoprior.data import load_sequence
 from endoprior.runs.remote import train_here, trainings
-from endoprior.runs.train import start_run, train
-from endoprior.runs.training_run import window_config
+from endoprior.runs.train import start_run, train, window_config
 
 SCENES = ("scene.safetensors", *(f"windows/{k:03d}/scene.safetensors" for k in range(3)))
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from known_surface import off_the_plane, seen
-from reader_checks import assert_rejected, remark_with
+from reader_checks import assert_damage_is_rejected, assert_rejected, remark_with
 from sequence_edits import change_poses, write
 
 from endoprior.core.config import DataConfig
@@ -204,13 +204,9 @@ RECTIFIED_BAD = {
 
 @pytest.mark.parametrize("case", FORPLANE_BAD)
 def test_bad_forplane_folders_are_rejected(forplane, case):
-    damage, named, words = FORPLANE_BAD[case]
-    damage(forplane)
-    assert_rejected(forplane, named, words)
+    assert_damage_is_rejected(forplane, *FORPLANE_BAD[case])
 
 
 @pytest.mark.parametrize("case", RECTIFIED_BAD)
 def test_bad_rectified_folders_are_rejected(rectified, case):
-    damage, named, words = RECTIFIED_BAD[case]
-    damage(rectified)
-    assert_rejected(rectified, named, words)
+    assert_damage_is_rejected(rectified, *RECTIFIED_BAD[case])

@@ -7,7 +7,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from reader_checks import assert_rejected, remark_with
+from reader_checks import assert_damage_is_rejected, assert_rejected, remark_with
 from sequence_edits import write
 
 from endoprior.core.checks import InputError
@@ -134,7 +134,7 @@ BAD = {
     "sources list": (describe(sources=["a"]), "sequence.json", "sources to map names to texts"),
     "frames": (describe(unexplained_frames=[1.5]), "sequence.json", "a list of frame numbers"),
     "frames outside": (describe(unexplained_frames=[12]), "sequence.json", "in 0..11, got 12"),
-    "version": (describe(format_version=2), "sequence.json", "format_version 1 to 1, got 2"),
+    "version": (describe(format_version=2), "sequence.json", "1 to 1, got 2. Fix: Update endoprior"),
     "version text": (describe(format_version="1"), "sequence.json", "format_version 1 to 1, got '1'"),
 }
 
@@ -142,9 +142,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_folders_are_rejected(plain, case):
     add_depth(plain)
-    damage, named, words = BAD[case]
-    damage(plain)
-    assert_rejected(plain, named, words)
+    assert_damage_is_rejected(plain, *BAD[case])
 
 
 def test_gt_masks_must_exist_if_the_option_names_them(plain):

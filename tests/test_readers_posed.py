@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from known_surface import color_change, of_rays, off_the_plane, pose, seen, turned
-from reader_checks import assert_rejected, edit_json, remark_with
+from reader_checks import assert_damage_is_rejected, assert_rejected, edit_json, remark_with
 from scipy.spatial.transform import Rotation
 from sequence_edits import write
 
@@ -146,9 +146,9 @@ def test_colmap_with_distortion(tmp_path):
 def test_the_lens_of_larger_images_is_scaled(nerfstudio):
     edit_json(nerfstudio / "transforms.json", w=192, h=160, fl_x=200, fl_y=208, cx=91, cy=84.5)
     assert_lands(nerfstudio)
-    assert remark_with(nerfstudio, "fx 200 px is scaled to 100 px for 96x80")
+    assert remark_with(nerfstudio, "200 px, is for 192x160 px; scaled to 100 px for 96x80")
     edit_json(nerfstudio / "transforms.json", w=192, h=150)
-    assert_rejected(nerfstudio, "transforms.json", "images of 192x150 px, or of that shape, got 96x80")
+    assert_rejected(nerfstudio, "transforms.json", "the size of the images, 96x80 px, or that shape, got 192x150")
 
 
 def test_the_angle_of_blender_is_a_focal_length(nerfstudio):
@@ -274,8 +274,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_files_of_nerfstudio_are_rejected(nerfstudio, case):
     damage, words = BAD[case]
-    damage(nerfstudio)
-    assert_rejected(nerfstudio, "transforms.json", words)
+    assert_damage_is_rejected(nerfstudio, damage, "transforms.json", words)
 
 
 def cut(name, size):
@@ -303,10 +302,8 @@ BAD_COLMAP = {
 
 @pytest.mark.parametrize("case", BAD_COLMAP)
 def test_bad_models_of_colmap_are_rejected(tmp_path, case):
-    kind, damage, named, words = BAD_COLMAP[case]
-    folder = write_colmap(tmp_path / "scene", kind)
-    damage(folder)
-    assert_rejected(folder, named, words)
+    kind, *damage = BAD_COLMAP[case]
+    assert_damage_is_rejected(write_colmap(tmp_path / "scene", kind), *damage)
 
 
 # --- `--poses` of the files of these programs
@@ -327,19 +324,8 @@ def test_prepare_reads_their_poses_by_the_names_of_images(tmp_path, kind):
     by_number, known, rule = read_model_poses(given if kind == "binary" else folder, range(FRAMES))
     assert np.allclose(by_number[[1, 3, 4]], want) and known.all() and "counted from 0" in rule
     out = tmp_path / "out"
-    words = [
-        "--poses",
-        str(given),
-        "--poses-unit-mm",
-        repr(1 / SCALE),
-        "--masks",
-        "none",
-        "--border",
-        "keep",
-        "--layout",
-        "mono",
-    ]
-    assert main(["prepare", str(folder / "images"), str(out), *words, "--depth", "none"]) == 0
+    words = "--masks none --border keep --layout mono --depth none --poses-unit-mm".split()
+    assert main(["prepare", str(folder / "images"), str(out), *words, repr(1 / SCALE), "--poses", str(given)]) == 0
     stored = np.load(out / "poses_bounds.npy")[:, :15].reshape(-1, 3, 5)
     assert np.allclose(stored[:, :, :4], np.stack(POSES)[:, :3], atol=1e-5)
 
@@ -350,17 +336,12 @@ def test_frames_without_a_pose_are_unexplained(tmp_path, capsys):
     del lines[5:7]  # the third image and its points
     (folder / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
     out = tmp_path / "out"
-    start = ["prepare", str(folder / "images")]
-    words = ["--masks", "none", "--border", "keep", "--layout", "mono", "--depth", "none", "--poses"]
+    start, words = ["prepare", str(folder / "images")], "--masks none --border keep --layout mono --depth none --poses"
+    words = words.split()
     assert main([*start, str(out), *words, str(folder)]) == 0
     assert "no camera pose, or another scene, in frames 2;" in capsys.readouterr().out
     assert json.loads((out / "sequence.json").read_text())["unexplained_frames"] == [2]
-    assert (
-        main(
-            ["prepare", str(folder / "images"), str(tmp_path / "y"), *words, str(folder), "--poses-convention", "llff"]
-        )
-        == 2
-    )
+    assert main([*start, str(tmp_path / "y"), *words, str(folder), "--poses-convention", "llff"]) == 2
     assert "whose axes are known" in capsys.readouterr().err
     assert main([*start, str(tmp_path / "x"), *words, str(folder / "images")]) == 2
     assert "got a folder without a model" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from known_surface import color_change, off_the_plane, pose, seen_through_lens, turned
-from reader_checks import assert_rejected, edit_json, remark_with
+from reader_checks import assert_damage_is_rejected, assert_rejected, edit_json, remark_with
 from scipy.spatial.transform import Rotation
 from sequence_edits import change_poses, write
 from video_files import write_video
@@ -221,6 +221,4 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_sequences_are_rejected(prepared, case):
-    damage, named, words = BAD[case]
-    damage(prepared)
-    assert_rejected(prepared, named, words)
+    assert_damage_is_rejected(prepared, *BAD[case])

@@ -9,11 +9,20 @@ import numpy as np
 import pytest
 import torch
 from gsplat_stand_in import NAN, forget, fully_fused_projection, loaded
-from render_scenes import NAMES, camera, one, pick, poison, render_with_grads, splats
+from render_scenes import (
+    NAMES,
+    camera,
+    one,
+    only_background,
+    pick,
+    poison,
+    rejects_other_types,
+    render_with_grads,
+    splats,
+)
 
 from endoprior import render
 from endoprior.core.checks import InputError
-from endoprior.core.types import Splats
 from endoprior.render.constants import NEAR_Z
 
 
@@ -126,7 +135,7 @@ def test_a_camera_far_from_the_origin_still_has_a_behind(gsplat):
     view = camera(seed=None)
     view.world_to_camera[:3, 3] = (3e8, -5e8, 9e8)
     lens = gsplat.lens_of(view, torch.device("cpu"))
-    assert (lens.behind * lens.z_row).sum() + lens.z_shift < 0
+    assert lens.depths(lens.behind) < 0
 
 
 def test_several_time_steps_in_one_call_equal_one_call_each(gsplat):
@@ -149,13 +158,7 @@ def test_several_time_steps_in_one_call_equal_one_call_each(gsplat):
 
 @pytest.mark.parametrize("num", [0, 3])
 def test_without_visible_gaussians_the_image_is_the_background(gsplat, num):
-    view = camera()
-    scene = pick(splats(view), torch.arange(num))
-    scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
-    got, grads = render_with_grads("gsplat", scene, view)
-    assert (got.color == torch.tensor([0.1, 0.2, 0.3])).all() and not got.alpha.any() and not got.depth.any()
-    assert got.means2d.shape == (num, 2) and not got.radii.any()
-    assert all(not grads[name].any() for name in (*NAMES, "means2d")) and grads["background"].any()
+    only_background("gsplat", num)
 
 
 def test_cameras_are_kept_by_value(gsplat):
@@ -167,16 +170,7 @@ def test_cameras_are_kept_by_value(gsplat):
 
 
 def test_other_types_and_devices_are_rejected(gsplat, monkeypatch):
-    view = camera()
-    scene = splats(view, 3)
-    doubled = Splats(*(getattr(scene, name).double() for name in NAMES))
-    with pytest.raises(ValueError, match=r"float32 on one cpu device; got torch.float64"):
-        gsplat.rasterize(doubled, view, background=torch.zeros(3).double())
-    with pytest.raises(ValueError, match=r"on one cpu device; got torch.float32 on .'cpu', 'meta'"):
-        gsplat.rasterize(replace(scene, sh=scene.sh.to("meta")), view, background=torch.zeros(3))
-    monkeypatch.setattr(gsplat, "DEVICE", "cuda")
-    with pytest.raises(ValueError, match=r"one cuda device; got torch.float32 on .'cpu'"):
-        gsplat.rasterize(scene, view, background=torch.zeros(3))
+    rejects_other_types(gsplat, monkeypatch)
 
 
 def test_without_gsplat_one_line_says_what_to_install(monkeypatch):

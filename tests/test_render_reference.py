@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from render_scenes import NAMES, camera, one, pick, render_with_grads, splats
+from render_scenes import NAMES, camera, one, render_with_grads, splats
 from scipy.special import sph_harm_y
 
 from endoprior import render
@@ -132,16 +132,6 @@ def test_detached_depth_is_the_same_image_with_constant_z():
     gap = grads["means"] - less["means"]
     assert gap.abs().max() > 1e-2
     assert torch.allclose(gap, (gap @ along)[:, None] * along, atol=1e-10)
-
-
-def test_order_of_the_list_does_not_matter():
-    view = camera()
-    scene = splats(view)
-    order = torch.randperm(60, generator=torch.Generator().manual_seed(1))
-    want, want_grads = render_with_grads("reference", scene, view)
-    got, grads = render_with_grads("reference", pick(scene, order), view)
-    assert torch.allclose(got.color, want.color, atol=1e-12)
-    assert torch.allclose(grads["means"], want_grads["means"][order], atol=1e-10)
 
 
 def test_unknown_backend_is_named():

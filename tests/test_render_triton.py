@@ -15,7 +15,20 @@ from subprocess import CalledProcessError
 import numpy as np
 import pytest
 import torch
-from render_scenes import NAMES, camera, compare, one, pick, poison, render_with_grads, splats
+from render_scenes import (
+    NAMES,
+    agree_where_full,
+    asks_for_one_gradient,
+    camera,
+    compare,
+    one,
+    only_background,
+    pick,
+    poison,
+    rejects_other_types,
+    render_with_grads,
+    splats,
+)  # fmt: skip
 
 from endoprior import render
 from endoprior.core.checks import InputError
@@ -62,20 +75,10 @@ def test_agrees_on_needles_and_sheets():
 
 
 def test_agrees_where_pixels_fill_up():
-    """Opaque layers: ALPHA_MAX binds, pixels stop, tiles are left early."""
     view = camera(16, 16, seed=2)
     scene = splats(view, 300, degree=0, seed=4, widths=(2.0, 8.0))
     scene = replace(scene, opacities=scene.opacities.clamp(min=0.6))
-    (want, want_grads), (got, grads) = (
-        render_with_grads("reference", scene, view),
-        render_with_grads("triton", scene, view),
-    )
-    assert want.alpha.min() > 0.999
-    off = ((got.color - want.color).abs().max(-1).values > 1e-5).float().mean()
-    assert off < 0.005, f"{off:.2%} of pixels differ"  # a stop may fall on the other side of a rounding
-    for name in ("sh", "opacities", "means2d"):
-        gap = (grads[name] - want_grads[name]).norm() / want_grads[name].norm()
-        assert gap < 1e-3, f"gradient of {name} differs by {gap:.1e}"
+    assert agree_where_full("triton", scene, view).alpha.min() > 0.999
 
 
 def stack(view, opacities, z_step=1.0):
@@ -142,13 +145,7 @@ def test_near_plane():
 
 @pytest.mark.parametrize("num", [0, 3])
 def test_without_visible_gaussians_the_image_is_the_background(num):
-    view = camera(33, 21)
-    scene = pick(splats(view), torch.arange(num))
-    scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
-    got, grads = render_with_grads("triton", scene, view)
-    assert (got.color == torch.tensor([0.1, 0.2, 0.3])).all() and not got.alpha.any() and not got.depth.any()
-    assert got.means2d.shape == (num, 2) and not got.radii.any()
-    assert all(not grads[name].any() for name in (*NAMES, "means2d")) and grads["background"].any()
+    only_background("triton", num)
 
 
 def tiles_of(scene, view):
@@ -188,19 +185,7 @@ def test_equal_input_gives_bit_identical_results():
 
 
 def test_gradients_reach_only_what_is_asked():
-    """A loss whose cotangents are expanded, most inputs frozen, one of them not contiguous."""
-    view = camera(23, 13)
-    scene = splats(view, 40, degree=1)
-    scene = replace(scene, sh=scene.sh.transpose(0, 1).contiguous().transpose(0, 1))
-    assert not scene.sh.is_contiguous()
-    found = {}
-    for name, dtype in (("reference", torch.float64), ("triton", torch.float32)):
-        values = {field: getattr(scene, field).to(dtype) for field in NAMES}
-        values["opacities"].requires_grad_()
-        out = render.load(name)(Splats(**values), view, background=torch.zeros(3, dtype=dtype))
-        (out.alpha.sum() + out.color.sum()).backward()
-        found[name] = values["opacities"].grad
-    assert (found["triton"] - found["reference"]).abs().max() <= 1e-5 * found["reference"].abs().max()
+    asks_for_one_gradient("triton")
 
 
 def test_cameras_are_kept_by_value():
@@ -212,16 +197,7 @@ def test_cameras_are_kept_by_value():
 
 
 def test_other_types_and_devices_are_rejected(monkeypatch):
-    view = camera(16, 9)
-    scene = splats(view, 3)
-    doubled = Splats(*(getattr(scene, name).double() for name in NAMES))
-    with pytest.raises(ValueError, match=r"float32 on one cpu device; got torch.float64"):
-        backend.rasterize(doubled, view, background=torch.zeros(3).double())
-    with pytest.raises(ValueError, match=r"on one cpu device; got torch.float32 on .'cpu', 'meta'"):
-        backend.rasterize(replace(scene, sh=scene.sh.to("meta")), view, background=torch.zeros(3))
-    monkeypatch.setattr(backend, "DEVICE", "cuda")
-    with pytest.raises(ValueError, match=r"one cuda device; got torch.float32 on .'cpu'"):
-        backend.rasterize(scene, view, background=torch.zeros(3))
+    rejects_other_types(backend, monkeypatch)
 
 
 def test_without_triton_one_line_says_what_to_install(monkeypatch):

@@ -1,6 +1,8 @@
 """SAM 2: a tiny one with random weights stands for the real one; nothing is downloaded."""
 
 import json
+import shutil
+from dataclasses import replace
 from importlib.util import find_spec
 from types import SimpleNamespace
 
@@ -15,12 +17,11 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.prepare import PrepareConfig, hub_model, pipeline, prepare
-from endoprior.prepare.hub_model import FILES
-from endoprior.prepare.masks import WORK
-from endoprior.prepare.record import names_path
-from endoprior.prepare.sam2 import DEFAULT_MODEL, is_sam2, open_sam2
-from endoprior.tool_masks.carry import carry
+from endoprior.prepare import PrepareConfig, networks, prepare
+from endoprior.prepare.config import is_sam2, names_path
+from endoprior.prepare.frames import WORK
+from endoprior.prepare.networks import DEFAULT_SAM2, FILES, open_sam2
+from endoprior.tool_masks.video_segmenter import carry
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.
@@ -102,8 +103,6 @@ def test_images_and_prompts_are_prepared_as_by_the_library(model):
 
 @needs_transformers
 def test_the_command_replaces_masks(model, phantom, tmp_path, capsys):
-    import shutil
-
     folder = shutil.copytree(phantom, tmp_path / "DATA")
     before = masks_of(folder)
     assert main(["masks", str(folder), "--with", f"sam2:{model}"]) == 0
@@ -138,7 +137,7 @@ SQUARE[60:80, 30:60] = True
 def segmenter(monkeypatch):
     """In place of SAM 2."""
     stand_in = Repainting()
-    monkeypatch.setattr(pipeline, "open_sam2", lambda value, option: stand_in)
+    monkeypatch.setattr(networks, "open_sam2", lambda value, option: stand_in)
     return stand_in
 
 
@@ -161,17 +160,13 @@ def test_prepare_writes_the_segmenters_masks_and_depth_made_with_them(phantom, t
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "v.mkv"]
     assert not (done.out / WORK).exists()
     # The same masks, given by a user, give the same depth.
-    given = prepare(tmp_path / "v.mkv", tmp_path / "given", OPTIONS.__class__(**given_options(done.out)))
-    own = prepare(tmp_path / "v.mkv", tmp_path / "own", OPTIONS.__class__(**given_options("auto")))
+    from_folder = replace(OPTIONS, masks=str(done.out / "masks"), mask_tool_value="high")
+    given = prepare(tmp_path / "v.mkv", tmp_path / "given", from_folder)
+    own = prepare(tmp_path / "v.mkv", tmp_path / "own", replace(OPTIONS, masks="auto"))
     depths = [[cv2.imread(str(f), -1) for f in sorted((d.out / "depth").glob("*.png"))] for d in (done, given, own)]
     near = [np.abs(a.astype(float) - b).mean() for a, b in zip(depths[0], depths[1], strict=True)]
     far = [np.abs(a.astype(float) - b).mean() for a, b in zip(depths[0], depths[2], strict=True)]
     assert max(near) < max(far), "nearer to depth made with these masks than with our own"
-
-
-def given_options(masks):
-    masks = masks if masks == "auto" else str(masks / "masks")
-    return {"masks": masks, "depth": "shading", "poses": "still", "border": "keep", "mask_tool_value": "high"}
 
 
 @pytest.mark.parametrize("stop_at", ["following tools, round 1", "following the camera", "writing frames"])
@@ -209,7 +204,7 @@ def test_a_missing_model_stops_prepare_before_it_starts(phantom, tmp_path, monke
     source = video(phantom, tmp_path)
     assert main(["prepare", str(source), str(tmp_path / "out"), "--masks", "sam2"]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and f"{DEFAULT_MODEL}: expected a model in the cache or a download" in error
+    assert error.count("\n") == 1 and f"{DEFAULT_SAM2}: expected a model in the cache or a download" in error
     assert "no network" in error and "`--masks sam2:FOLDER`" in error
     assert [path.name for path in tmp_path.iterdir()] == ["v.mkv"]
 
@@ -257,7 +252,7 @@ def test_other_files_are_an_error(model, tmp_path):
 
 @pytest.mark.parametrize("option", ["--masks", "--with"])
 def test_without_the_package_its_name_is_said(monkeypatch, option):
-    monkeypatch.setattr(hub_model, "find_spec", lambda name: None)
+    monkeypatch.setattr(networks, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=rf"{option} sam2: expected the transformers package, got none. Fix: `pip"):
         open_sam2("sam2", option)
 

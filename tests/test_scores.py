@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from endoprior.cli.score_table import score_table
+from endoprior.cli.evaluate import score_table
 from endoprior.evaluation.registry import all_scores, scorers
 
 PAGE = Path(__file__).parents[1] / "docs" / "scores.md"

@@ -6,7 +6,7 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.prepare import relative_depth
-from endoprior.prepare.relative_depth import MAX_RATIO, NEAR_RATIO, RELIEF, fit_reference, fit_shading, relative_to_mm
+from endoprior.prepare.relative_depth import MAX_RATIO, NEAR_RATIO, RELIEF, RelativeScale, fit_shading
 
 WIDTH, HEIGHT = 201, 151
 COLUMN, ROW = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))
@@ -102,40 +102,38 @@ def test_samples_without_tissue_are_an_error():
 def test_relative_disparity_is_linear_in_inverse_depth():
     disparity = (3 + 0.5 * cv2.resize(1 / BUMP, (80, 60))).astype(np.float32)
     usable = np.ones(disparity.shape, bool)
-    reference = fit_reference([disparity], [usable], "disparity", 60)
-    depth = relative_to_mm(disparity, "disparity", reference)
+    reference = RelativeScale.fit("disparity", [disparity], [usable], 60)
+    depth = reference.mm(disparity)
     assert np.median(depth) == pytest.approx(60, rel=1e-3)
     assert np.percentile(depth, 2) == pytest.approx(60 / NEAR_RATIO, rel=1e-2)
     slope, shift = np.polyfit(disparity.ravel().astype(np.float64), 1 / depth.ravel().astype(np.float64), 1)
     np.testing.assert_allclose(slope * disparity + shift, 1 / depth, rtol=1e-4)
     # Scale and shift of the network do not matter, and another frame uses the same reference.
-    again = relative_to_mm(
-        7 * disparity + 2, "disparity", fit_reference([7 * disparity + 2], [usable], "disparity", 60)
-    )
+    again = RelativeScale.fit("disparity", [7 * disparity + 2], [usable], 60).mm(7 * disparity + 2)
     np.testing.assert_allclose(again, depth, rtol=1e-3)
-    assert relative_to_mm(disparity + 0.001, "disparity", reference).mean() < depth.mean()
+    assert reference.mm(disparity + 0.001).mean() < depth.mean()
 
 
 def test_relative_depth_keeps_its_proportions():
     relative = cv2.resize(BUMP, (80, 60)) / 1000
-    reference = fit_reference([relative], [np.ones(relative.shape, bool)], "depth", 70)
-    depth = relative_to_mm(relative, "depth", reference)
+    reference = RelativeScale.fit("depth", [relative], [np.ones(relative.shape, bool)], 70)
+    depth = reference.mm(relative)
     np.testing.assert_allclose(depth / relative, 70 / np.median(relative), rtol=1e-5)
 
 
 def test_invalid_values_become_missing():
     relative = np.array([[np.nan, np.inf, 0.0, -1.0, 1.0, 1e9, 1e-9]])
-    reference = fit_reference([np.array([[0.5, 1.0, 1.5, np.nan, -3.0]])], [np.ones((1, 5), bool)], "depth", 70)
-    depth = relative_to_mm(relative, "depth", reference)
+    reference = RelativeScale.fit("depth", [np.array([[0.5, 1.0, 1.5, np.nan, -3.0]])], [np.ones((1, 5), bool)], 70)
+    depth = reference.mm(relative)
     np.testing.assert_allclose(depth, [[0, 0, 0, 0, 70, 70 * MAX_RATIO, 70 / MAX_RATIO]], rtol=1e-6)
-    reference = fit_reference([np.linspace(-1, 1, 101)[None]], [np.ones((1, 101), bool)], "disparity", 70)
-    depth = relative_to_mm(np.array([[np.nan, -1e9, 0.0, 1e9]]), "disparity", reference)
+    reference = RelativeScale.fit("disparity", [np.linspace(-1, 1, 101)[None]], [np.ones((1, 101), bool)], 70)
+    depth = reference.mm(np.array([[np.nan, -1e9, 0.0, 1e9]]))
     np.testing.assert_allclose(depth, [[0, 70 * MAX_RATIO, 70, 70 / MAX_RATIO]], rtol=1e-6, atol=1e-4)
 
 
 def test_relative_samples_are_checked():
     ones = np.ones((4, 4))
     with pytest.raises(InputError, match="none"):
-        fit_reference([ones], [ones < 0], "depth")
+        RelativeScale.fit("depth", [ones], [ones < 0])
     with pytest.raises(InputError, match="vary"):
-        fit_reference([ones], [ones > 0], "disparity")
+        RelativeScale.fit("disparity", [ones], [ones > 0])

@@ -15,7 +15,7 @@ from endoprior.data import load_sequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.scorers import other_views
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.side_views import side_eyes
+from endoprior.phantom.views import side_eyes
 
 NAMES = {"left20", "left10", "right10", "right20", "aside15"}
 

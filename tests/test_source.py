@@ -6,9 +6,9 @@ import pytest
 from video_files import write_video
 
 from endoprior.core.checks import InputError
-from endoprior.prepare.frame_selection import FrameSelection
 from endoprior.prepare.source import open_source
 from endoprior.prepare.video import SourceFrame
+from endoprior.prepare.video_clip import FrameSelection
 
 
 def pictures_of(count, height=24, width=32):

@@ -18,8 +18,8 @@ from endoprior.model.presets import preset
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
-from endoprior.training.stage import Stage
 from endoprior.training.step import Drawn
+from endoprior.training.trainer import Stage
 from endoprior_baselines.surface_points import grid_points
 from endoprior_baselines.surgicalgaussian import METHOD, covariances, distance_change, neighbor_terms, ssim
 from endoprior_baselines.time_network import TimeNetwork, encoded, state_shapes

@@ -135,10 +135,7 @@ def test_a_full_disk_behind_stdout_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        ("NUMBA_NUM_THREADS", "0", "NUMBA_NUM_THREADS: expected a number of threads"),
-        ("NUMBA_NUM_THREADS", "-1", "NUMBA_NUM_THREADS: expected a number of threads"),
-        ("NUMBA_NUM_THREADS", "99999", "NUMBA_NUM_THREADS: expected a number of threads"),
-        ("NUMBA_NUM_THREADS", "1.5", "NUMBA_NUM_THREADS: expected a number of threads"),
+        *(("NUMBA_NUM_THREADS", text, "NUMBA_NUM_THREADS: expected a number") for text in ("0", "-1", "99999", "1.5")),
         ("NUMBA_THREADING_LAYER", "foo", "NUMBA_THREADING_LAYER: expected one of default"),
         ("HOME", "relative", "HOME: expected an absolute path"),
     ],

@@ -7,7 +7,8 @@ import torch
 from reference import temporal as reference
 
 from endoprior.model.presets import preset
-from endoprior.training import temporal, temporal_numba
+from endoprior.training import local_motion, temporal
+from endoprior.training.local_motion import affinity_numba, local_motion_numba, neighbors_numba
 
 CFG = preset("paper").temporal
 
@@ -19,39 +20,29 @@ def points(num=40, seed=0):
 def with_torch(now, before, indices, pair_weights, smooth_l1=False):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal.local_motion(now, before, indices, pair_weights, smooth_l1)
+    return local_motion.local_motion(now, before, indices, pair_weights, smooth_l1)
 
 
 def loss(now, before, weights=None):
-    indices, distances = temporal_numba.neighbors(before.detach().numpy(), temporal.NUM_NEIGHBORS)
+    indices, distances = neighbors_numba(before.detach().numpy(), local_motion.NUM_NEIGHBORS)
     weights = np.ones(len(before)) if weights is None else weights
-    return temporal_numba.local_motion(now, before, indices, temporal_numba.affinity(distances, indices, weights))
+    return local_motion_numba(now, before, indices, affinity_numba(distances, indices, weights))
 
 
-def test_motion_weight_is_half_at_the_threshold():
+def test_weights_and_samples_by_hand():
     assert temporal.motion_weight(np.array([0.45]), 0.45, 0.08)[0] == pytest.approx(0.5)
+    assert temporal.kept_motion_weight(np.array([-1.0]))[0] == 0, "up to the least one"
+    assert temporal.systematic_sample(np.array([0, 1.0, 0, 2.0]), 5).tolist() == [1, 3]
 
 
-def test_relaxation_lowers_the_threshold_until_enough_count():
+def test_relaxation_lowers_the_threshold_until_enough_count_or_to_its_floor():
     score = np.full(1000, 0.1)
     score[:20] = 0.9
-    fixed = temporal.kept_motion_weight(score)
-    relaxed = temporal.kept_motion_weight(score, relaxed=True)
+    fixed, relaxed = (temporal.kept_motion_weight(score, relaxed=relaxed) for relaxed in (False, True))
     assert temporal.effective_size(relaxed) >= temporal.MIN_EFFECTIVE > temporal.effective_size(fixed)
-
-
-def test_relaxation_stops_at_its_floor():
-    weights = temporal.kept_motion_weight(np.zeros(10), relaxed=True)
     # After eight tries: threshold 0.25, temperature 0.30.
-    assert weights == pytest.approx(temporal.motion_weight(np.zeros(10), 0.25, 0.30))
-
-
-def test_weights_up_to_the_least_one_are_dropped():
-    assert temporal.kept_motion_weight(np.array([-1.0]))[0] == 0
-
-
-def test_systematic_sample_takes_all_when_they_fit():
-    assert temporal.systematic_sample(np.array([0, 1.0, 0, 2.0]), 5).tolist() == [1, 3]
+    floor = temporal.motion_weight(np.zeros(10), 0.25, 0.30)
+    assert temporal.kept_motion_weight(np.zeros(10), relaxed=True) == pytest.approx(floor)
 
 
 def test_systematic_sample_follows_the_weights():
@@ -107,7 +98,7 @@ def test_choose_needs_enough_points():
 
 def test_neighbors_agree_with_a_full_search():
     p = points(60)
-    indices, distances = temporal_numba.neighbors(p, 5)
+    indices, distances = neighbors_numba(p, 5)
     table = np.linalg.norm(p[:, None] - p[None], axis=-1)
     np.fill_diagonal(table, np.inf)
     assert indices.tolist() == table.argsort(1)[:, :5].tolist()
@@ -115,24 +106,24 @@ def test_neighbors_agree_with_a_full_search():
 
 
 def test_neighbors_of_coincident_points_leave_out_oneself():
-    indices, _ = temporal_numba.neighbors(np.zeros((12, 3)), 8)
+    indices, _ = neighbors_numba(np.zeros((12, 3)), 8)
     assert indices.shape == (12, 8)
     assert not (indices == np.arange(12)[:, None]).any()
 
 
 def test_affinity_is_equation_10():
     p, weights = points(30), np.random.default_rng(1).uniform(0.1, 1, 30)
-    indices, distances = temporal_numba.neighbors(p, 4)
-    got = temporal_numba.affinity(distances, indices, weights)
+    indices, distances = neighbors_numba(p, 4)
+    got = affinity_numba(distances, indices, weights)
     np.testing.assert_allclose(got, reference.pair_weights(p, indices, weights))
 
 
 def test_loss_is_the_literal_double_loop():
     before, now = points(20, 1), points(20, 2)
     weights = np.random.default_rng(3).uniform(0.2, 1, 20)
-    indices, distances = temporal_numba.neighbors(before, 8)
-    pair = temporal_numba.affinity(distances, indices, weights)
-    got = temporal_numba.local_motion(torch.from_numpy(now), torch.from_numpy(before), indices, pair)
+    indices, distances = neighbors_numba(before, 8)
+    pair = affinity_numba(distances, indices, weights)
+    got = local_motion_numba(torch.from_numpy(now), torch.from_numpy(before), indices, pair)
     # The root's 1e-8 mm^2 adds less than 1e-9 to displacements of millimeters.
     assert [term.item() for term in got] == pytest.approx(reference.local_motion(now, before, indices, pair), rel=1e-7)
 
@@ -156,19 +147,19 @@ def test_a_rigid_motion_costs_no_distance():
 
 def test_released_huber_is_the_literal_one_over_delta():
     x = torch.tensor([0.0, 0.003, 0.01, 0.5])
-    literal, scaled = temporal.huber(x, 0.01), temporal.huber(x, 0.01, smooth_l1=True)
+    literal, scaled = local_motion.huber(x, 0.01), local_motion.huber(x, 0.01, smooth_l1=True)
     assert literal.tolist() == pytest.approx([0, 4.5e-6, 5e-5, 0.01 * 0.495])
     torch.testing.assert_close(scaled, literal / 0.01)
 
 
 def test_gradient_against_central_differences(monkeypatch):
-    monkeypatch.setattr(temporal_numba, "HUBER_DELTA", 2.0)
+    monkeypatch.setattr(local_motion, "HUBER_DELTA", 2.0)
     now, before = (torch.from_numpy(points(15, seed)).requires_grad_() for seed in (5, 6))
-    indices, distances = temporal_numba.neighbors(before.detach().numpy(), 8)
-    pair = temporal_numba.affinity(distances, indices, np.ones(15))
+    indices, distances = neighbors_numba(before.detach().numpy(), 8)
+    pair = affinity_numba(distances, indices, np.ones(15))
 
     def terms(a, b):
-        return temporal_numba.local_motion(a, b, indices, pair)
+        return local_motion_numba(a, b, indices, pair)
 
     assert torch.autograd.gradcheck(terms, (now, before), eps=1e-6, atol=1e-6)
 
@@ -185,8 +176,8 @@ def motion(num=600, seed=0, dtype=torch.float32):
     rng = np.random.default_rng(seed)
     before = torch.from_numpy(rng.uniform([-10, -10, 70], [10, 10, 90], (num, 3))).to(dtype)
     now = before + torch.from_numpy(rng.normal(0.5, 0.05, (num, 3))).to(dtype)
-    indices, distances = temporal_numba.neighbors(before.numpy(), 8)
-    return now, before, indices, temporal_numba.affinity(distances, indices, rng.uniform(0.1, 1, num))
+    indices, distances = neighbors_numba(before.numpy(), 8)
+    return now, before, indices, affinity_numba(distances, indices, rng.uniform(0.1, 1, num))
 
 
 def loss_and_gradients(function, now, before, indices, pair, smooth_l1=False, upstream=(2.0, -3.0)):
@@ -201,7 +192,7 @@ def loss_and_gradients(function, now, before, indices, pair, smooth_l1=False, up
 @pytest.mark.parametrize("smooth_l1", [False, True])
 def test_fused_loss_and_gradient_are_those_of_the_torch_implementation(dtype, rtol, smooth_l1):
     now, before, indices, pair = motion(dtype=dtype)
-    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, smooth_l1)
+    got = loss_and_gradients(local_motion_numba, now, before, indices, pair, smooth_l1)
     want = loss_and_gradients(with_torch, now.double(), before.double(), indices, pair, smooth_l1)
     for g, w in zip(got[:2], want[:2], strict=True):
         assert g.dtype == dtype and g.item() == pytest.approx(w.item(), rel=min(rtol, 1e-5))
@@ -213,7 +204,7 @@ def test_fused_loss_and_gradient_are_those_of_the_torch_implementation(dtype, rt
 def test_a_point_that_is_everybodys_neighbor_gets_all_their_pulls():
     now, before, indices, pair = motion(dtype=torch.float64)
     indices[1:, 3] = 0
-    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair)
+    got = loss_and_gradients(local_motion_numba, now, before, indices, pair)
     want = loss_and_gradients(with_torch, now, before, indices, pair)
     for g, w in zip(got, want, strict=True):
         torch.testing.assert_close(g, w, rtol=1e-10, atol=1e-14)
@@ -221,17 +212,17 @@ def test_a_point_that_is_everybodys_neighbor_gets_all_their_pulls():
 
 def test_only_the_end_that_wants_a_gradient_gets_one():
     now, before, indices, pair = motion()
-    both = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, upstream=(1.0, 1.0))
+    both = loss_and_gradients(local_motion_numba, now, before, indices, pair, upstream=(1.0, 1.0))
     for wanted in (0, 1):
         ends = [now.clone(), before.clone()]
         ends[wanted].requires_grad_()
-        sum(temporal_numba.local_motion(*ends, indices, pair)).backward()
+        sum(local_motion_numba(*ends, indices, pair)).backward()
         assert torch.equal(ends[wanted].grad, both[2 + wanted]) and ends[1 - wanted].grad is None
-    assert not temporal_numba.local_motion(now, before, indices, pair)[0].requires_grad
+    assert not local_motion_numba(now, before, indices, pair)[0].requires_grad
 
 
 def test_pulls_within_the_cloud_cancel():
-    _, _, on_now, on_before = loss_and_gradients(temporal_numba.local_motion, *motion(dtype=torch.float64))
+    _, _, on_now, on_before = loss_and_gradients(local_motion_numba, *motion(dtype=torch.float64))
     for gradient in (on_now, on_before):  # the loss does not change when one end moves as a whole
         assert gradient.sum(0).abs().max() < 1e-12 < gradient.abs().max()
 
@@ -245,7 +236,7 @@ def test_the_number_of_threads_changes_no_bit():
             results.append(
                 (
                     torch.from_numpy(pair),
-                    *loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair),
+                    *loss_and_gradients(local_motion_numba, now, before, indices, pair),
                 )
             )
     finally:
@@ -256,26 +247,24 @@ def test_the_number_of_threads_changes_no_bit():
 
 def test_pairs_without_weight_keep_a_little():
     p = points(30)
-    indices, distances = temporal_numba.neighbors(p, 4)
-    assert (temporal_numba.affinity(distances, indices, np.zeros(30)) == temporal.SUM_EPS).all()
+    indices, distances = neighbors_numba(p, 4)
+    assert (affinity_numba(distances, indices, np.zeros(30)) == local_motion.SUM_EPS).all()
 
 
 def test_a_point_at_nan_shows():
     now, before, indices, pair = motion()
     now[7] = torch.nan
-    displacement, distance, on_now, on_before = loss_and_gradients(
-        temporal_numba.local_motion, now, before, indices, pair, CFG
-    )
+    displacement, distance, on_now, on_before = loss_and_gradients(local_motion_numba, now, before, indices, pair)
     assert displacement.isnan() and distance.isnan() and on_now[7].isnan().all() and on_before[7].isnan().all()
 
 
 def test_what_does_not_fit_together_is_an_error():
     now, before, indices, pair = motion()
     with pytest.raises(ValueError, match="before must have shape"):
-        temporal_numba.local_motion(now, before[:-1], indices, pair)
+        local_motion_numba(now, before[:-1], indices, pair)
     with pytest.raises(ValueError, match="before must have the type"):
-        temporal_numba.local_motion(now, before.double(), indices, pair)
+        local_motion_numba(now, before.double(), indices, pair)
     for wrong in (-1, len(now)):
         indices[3, 2] = wrong
         with pytest.raises(ValueError, match="indices must be in"):
-            temporal_numba.local_motion(now, before, indices, pair)
+            local_motion_numba(now, before, indices, pair)

@@ -21,8 +21,15 @@ from endoprior.model.presets import preset, preset_names
 from endoprior.runs.folder import CONFIG
 from endoprior.runs.log import MARGIN, mask_facts
 from endoprior.runs.train import start_run, train
-from endoprior.tool_masks.color_reach import LEAST_POINTS, MOST, WIDTH_PX, ColorReach, color_reach
-from endoprior.tool_masks.margin import away_from_tools, with_tool_margin
+from endoprior.tool_masks.margin import (
+    LEAST_POINTS,
+    MOST,
+    WIDTH_PX,
+    ColorReach,
+    away_from_tools,
+    color_reach,
+    with_tool_margin,
+)
 from endoprior.tool_masks.regions import LEAST_SHARE
 
 TISSUE, TOOL = (180, 80, 70), (90, 95, 110)

@@ -12,11 +12,17 @@ import torch
 from endoprior.core.checks import InputError
 from endoprior.data.images import read_color, read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.tool_masks import FoundTools, ToolFinder, weights
+from endoprior.tool_masks import FoundTools, ToolFinder, network
 from endoprior.tool_masks.finder import network_size
-from endoprior.tool_masks.network import LONG_SIDE_PX, ToolNetwork, network_input
+from endoprior.tool_masks.network import (
+    LONG_SIDE_PX,
+    ToolNetwork,
+    network_from,
+    network_input,
+    shipped_network,
+    weights_of,
+)
 from endoprior.tool_masks.regions import entering_regions
-from endoprior.tool_masks.weights import network_from, shipped_network, weights_of
 
 pytestmark = pytest.mark.usefixtures("all_vessels")
 FRAMES = 4
@@ -90,12 +96,9 @@ def test_any_size_is_taken(shape):
     assert max(network_size(shape)) == LONG_SIDE_PX
 
 
-def test_masks_of_low_confidence_are_uncertain():
+def test_masks_of_low_confidence_are_uncertain_and_mismatched_shapes_are_named():
     tool = np.ones((4, 4), bool)
     assert [FoundTools(tool, confidence).uncertain for confidence in (0.49, 0.51)] == [True, False]
-
-
-def test_mismatched_shapes_are_named():
     image, view = np.zeros((8, 9, 3), np.uint8), np.ones((8, 9), bool)
     with pytest.raises(ValueError, match="view must have shape"):
         ToolFinder().find(image, view.T)
@@ -127,16 +130,16 @@ def test_tools_enter_end_first(box, kept):
 
 
 def test_the_shipped_weights_are_those_of_the_model_card():
-    data = weights.FILE.read_bytes()
-    assert hashlib.sha256(data).hexdigest() == weights.SHA256
+    data = network.FILE.read_bytes()
+    assert hashlib.sha256(data).hexdigest() == network.SHA256
     assert len(data) <= 2 * 2**20
-    assert weights.SHA256 in CARD.read_text(encoding="utf-8")
+    assert network.SHA256 in CARD.read_text(encoding="utf-8")
 
 
 def test_changed_or_missing_weights_are_one_line(tmp_path, monkeypatch):
     shipped_network.cache_clear()
     file = tmp_path / "weights.safetensors"
-    monkeypatch.setattr(weights, "FILE", file)
+    monkeypatch.setattr(network, "FILE", file)
     with pytest.raises(InputError, match="expected the weights of the tool network"):
         shipped_network()
     file.write_bytes(weights_of(ToolNetwork()))

@@ -12,8 +12,7 @@ import torch
 from safetensors.torch import save
 
 from endoprior.core.checks import InputError
-from endoprior.tool_masks.network import ToolNetwork
-from endoprior.tool_masks.weights import network_from_file
+from endoprior.tool_masks.network import ToolNetwork, network_from_file
 from endoprior_studies.tool_training import benchmark, composites
 from endoprior_studies.tool_training.benchmark import Counts, TestFrame, count, pictures, score_set
 from endoprior_studies.tool_training.camera import photographed, random_view

@@ -13,8 +13,8 @@ from endoprior.data import load_sequence
 from endoprior.model.motion import basis_weights
 from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
+from endoprior.training.losses import StartTracks, track_term
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.track_loss import StartTracks, track_term
 
 BASIS = BasisConfig(num_bases=6)
 CAMERA = Camera(320, 256, 300.0, 300.0, 160.0, 128.0, np.eye(4))
@@ -27,7 +27,7 @@ def at_depth(*depths: float) -> torch.Tensor:
 
 def still_tracks(num: int, followed: list[list[float]]) -> StartTracks:
     """Tracks of points that do not move."""
-    return StartTracks.of_first(torch.zeros(num, 6, 3), torch.tensor(followed))
+    return StartTracks(torch.zeros(num, 6, 3), torch.tensor(followed), torch.arange(num))
 
 
 def random_case(seed: int = 0):

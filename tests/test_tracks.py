@@ -26,9 +26,7 @@ from endoprior.training.gaussian_trainer import GaussianTrainer
 WIDTH, HEIGHT, NUM_FRAMES, DEPTH = 160, 128, 7, 50.0
 
 
-def moving_frames(
-    step_px: tuple[float, float], *, tool: slice | None = None, moving: slice = slice(None)
-) -> list[Frame]:
+def moving_frames(step_px: tuple[float, float], *, moving: slice = slice(None)) -> list[Frame]:
     """A textured plane at 50 mm that shifts by `step_px` a frame in the columns `moving` and is static elsewhere."""
     noise = np.random.default_rng(0).random((HEIGHT + 160, WIDTH + 160, 3)).astype(np.float32)
     texture = cv2.GaussianBlur(noise, (0, 0), 3)
@@ -39,12 +37,8 @@ def moving_frames(
         shift = np.array([[1, 0, step_px[0] * i - 80], [0, 1, step_px[1] * i - 80]], np.float32)
         picture = cv2.warpAffine(texture, np.array([[1, 0, -80], [0, 1, -80]], np.float32), (WIDTH, HEIGHT))
         picture[:, moving] = cv2.warpAffine(texture, shift, (WIDTH, HEIGHT))[:, moving]
-        mask = np.ones((HEIGHT, WIDTH), bool)
-        if tool is not None:
-            mask[:, tool] = False
-        depth = np.full((HEIGHT, WIDTH), DEPTH, np.float32)
-        rgb = (255 * picture).astype(np.uint8)
-        frames.append(Frame(i, i / NUM_FRAMES, camera, rgb, mask, depth, np.ones((HEIGHT, WIDTH), bool)))
+        depth, rgb = np.full((HEIGHT, WIDTH), DEPTH, np.float32), (255 * picture).astype(np.uint8)
+        frames.append(Frame(i, i / NUM_FRAMES, camera, rgb, depth > 0, depth, depth > 0))
     return frames
 
 
@@ -89,20 +83,15 @@ def test_static_points_get_no_motion_and_moving_points_do():
     assert np.abs(motion[2]).max() > 0.5
 
 
-def test_a_track_ends_behind_the_tool():
-    frames = moving_frames((4.0, 0.0), tool=slice(90, None))
-    pixels = followed(frames, cloud_at([(80.5, 64.5)], 0, frames[0].camera))
-    assert np.isfinite(pixels[:3]).all()
-    assert np.isnan(pixels[3:]).all()
-
-
-def test_a_track_continues_after_the_tool():
+@pytest.mark.parametrize(("hidden", "columns"), [(range(NUM_FRAMES), 90), ((2, 3), 70)])
+def test_a_track_ends_behind_the_tool_and_continues_after_it(hidden, columns):
     frames = moving_frames((4.0, 0.0))
-    for k in (2, 3):
-        frames[k].tissue_mask[:, 70:] = False
-    pixels = followed(frames, cloud_at([(80.5, 64.5)], 0, frames[0].camera))
-    assert np.isnan(pixels[2:4]).all()
-    np.testing.assert_allclose(pixels[4:, 0, 0], 80.5 + 4 * np.arange(4, NUM_FRAMES), atol=0.2)
+    for k in hidden:
+        frames[k].tissue_mask[:, columns:] = False
+    pixels, x = followed(frames, cloud_at([(80.5, 64.5)], 0, frames[0].camera))[:, 0], 80.5 + 4 * np.arange(NUM_FRAMES)
+    lost = [k in hidden and x[k] > columns for k in range(NUM_FRAMES)]
+    assert np.isnan(pixels[:, 0]).tolist() == lost
+    np.testing.assert_allclose(pixels[:, 0], np.where(lost, np.nan, x), atol=0.2)
 
 
 def test_flow_to_a_distant_frame_does_not_drift():
@@ -142,8 +131,7 @@ def test_a_step_agrees_with_arrays():
     cycle_px = np.linalg.norm(step + 2 * bilinear(back, end / 2), axis=-1)
     found = ((end >= 0) & (end <= (WIDTH, HEIGHT))).all(-1) & tissue_mask[y, x]
     assert 500 < found.sum() < 3500
-    got_end, got_cycle = np.empty_like(start), np.empty(len(start))
-    tracks.follow(start, there, back, tissue_mask, got_end, got_cycle)
+    got_end, got_cycle = tracks.follow(start, there, back, tissue_mask)
     np.testing.assert_allclose(got_end, end, rtol=1e-6, atol=1e-5)  # float32 flow
     np.testing.assert_allclose(got_cycle, np.where(found, cycle_px, np.inf), rtol=1e-5, atol=1e-5)
 
@@ -155,18 +143,19 @@ def tracked_sheet() -> np.ndarray:
     return sheet + np.arange(6)[:, None, None] * np.array([1.0, 2.0, 0.0])
 
 
-@pytest.mark.parametrize("lost", [slice(1, 4), slice(3, None), slice(0, 2)])
+@pytest.mark.parametrize(
+    "lost",
+    [
+        [np.s_[1:4, 14:16]],
+        [np.s_[3:, 14:16]],
+        [np.s_[:2, 14:16]],
+        [np.s_[2:, :12], np.s_[4:, 12:20]],  # many at once, then those that carried them
+    ],
+)
 def test_lost_points_move_as_their_neighbors_do(lost):
     positions = tracked_sheet()
-    true = positions.copy()
-    positions[lost, 14:16] = np.nan
-    np.testing.assert_allclose(fill_gaps(positions), true)
-
-
-def test_lost_points_find_other_neighbors_where_theirs_are_lost_too():
-    positions = tracked_sheet()
-    positions[2:, :12] = np.nan  # lost at once, with the points around
-    positions[4:, 12:20] = np.nan  # then those that carried them
+    for part in lost:
+        positions[part] = np.nan
     np.testing.assert_allclose(fill_gaps(positions), tracked_sheet())
 
 
@@ -230,16 +219,11 @@ def test_unmeasured_depth_leaves_a_gap():
 
 def test_frames_too_small_for_flow_get_no_motion(caplog):
     frames = moving_frames((1.0, 0.0))
-    small = [
-        Frame(f.index, f.time, f.camera, f.rgb_u8[:16], f.tissue_mask[:16], f.depth[:16], f.depth_valid[:16])
-        for f in frames
-    ]
-    motion = tracks.initial_motion(
-        small, cloud_at([(8.5, 8.5)], 0, frames[0].camera), BasisConfig(num_bases=4)
-    ).coefficients
-    assert motion.shape == (1, 4, 3)
-    assert not motion.any()
-    assert "too small" in caplog.text
+    cut = ("rgb_u8", "tissue_mask", "depth", "depth_valid")
+    small = [replace(f, **{name: getattr(f, name)[:16] for name in cut}) for f in frames]
+    cloud = cloud_at([(8.5, 8.5)], 0, frames[0].camera)
+    motion = tracks.initial_motion(small, cloud, BasisConfig(num_bases=4)).coefficients
+    assert motion.shape == (1, 4, 3) and not motion.any() and "too small" in caplog.text
 
 
 def test_training_starts_along_the_tracks(tmp_path):

@@ -52,12 +52,9 @@ def test_disparity_is_not_depth(tool):
     assert np.isnan(guess.tool_ratio) != tool
 
 
-def test_a_near_tool_reveals_disparity_without_shading():
+def test_a_near_tool_decides_without_shading_and_where_tissue_is_brighter_far_away():
     assert guess_unit([view("disparity", shading=0)]).unit == "disparity"
     assert guess_unit([view("depth", shading=0)]).unit == "mm"
-
-
-def test_tissue_that_is_brighter_far_away_stays_depth_beside_a_near_tool():
     guess = guess_unit([view("depth", shading=-1)])
     assert guess.shading > 0.5 and guess.tool_ratio < 0.7 and guess.unit == "mm"
 
@@ -67,10 +64,7 @@ def test_no_depth_and_constant_depth():
     none = guess_unit([(values, np.zeros_like(tissue), image, tissue)])
     assert (none.unit, none.mm_per_unit, none.reason) == ("none", None, "no pixel has depth")
     assert guess_unit([(np.full_like(values, 70), tissue | True, image, tissue)]).shading == 0
-
-
-def test_frames_without_tissue_use_all_pixels():
-    values, valid, image, tissue = view()
+    values, valid, image, tissue = view()  # without tissue all pixels count
     assert guess_unit([(values, valid, image, np.zeros_like(tissue))]).unit == "mm"
 
 

@@ -45,6 +45,10 @@ def cloud_of(frames: list[Frame]) -> PointCloud:
     return concatenated(parts)
 
 
+def at_rest(frames: list[Frame], cloud: PointCloud) -> tuple[PointCloud, np.ndarray]:
+    return unseen_points(frames, cloud, np.zeros((len(cloud), 0, 3), np.float32), BASIS)
+
+
 def test_convex_hull() -> None:
     mask = np.zeros((9, 12), bool)
     assert not convex_hull(mask).any()
@@ -87,8 +91,8 @@ def test_everything_and_nothing_known() -> None:
 
 def test_behind_a_tool_that_stands_still_the_tissue_goes_on() -> None:
     frames = [frame(k, with_tool(slice(120, 200))) for k in range(4)]
-    found, motion = unseen_points(frames, cloud_of(frames), None, BASIS)
-    assert motion is None and len(found) == (80 // SIZE) ** 2
+    found, motion = at_rest(frames, cloud_of(frames))
+    assert motion.shape == (len(found), 0, 3) and len(found) == (80 // SIZE) ** 2
     pixels, z = project(found.points.astype(np.float64), CAMERA)
     np.testing.assert_allclose(z, 60 + 20 * pixels[:, 0] / WIDTH, rtol=0.01)
     np.testing.assert_allclose(found.colors, np.tile(COLOR / 255, (len(found), 1)), atol=1e-5)
@@ -98,21 +102,21 @@ def test_behind_a_tool_that_stands_still_the_tissue_goes_on() -> None:
 def test_what_the_tool_looks_like_does_not_matter() -> None:
     tissue = with_tool(slice(120, 200))
     usual, other = ([frame(k, tissue, *looks) for k in range(2)] for looks in ((30, 20.0), (255, 0.0)))
-    clouds = [unseen_points(frames, cloud_of(usual), None, BASIS)[0] for frames in (usual, other)]
+    clouds = [at_rest(frames, cloud_of(usual))[0] for frames in (usual, other)]
     np.testing.assert_array_equal(clouds[0].points, clouds[1].points)
     np.testing.assert_array_equal(clouds[0].colors, clouds[1].colors)
 
 
 def test_what_another_frame_shows_is_not_guessed() -> None:
     frames = [frame(0, with_tool(slice(60, 120))), frame(1, with_tool(slice(200, 260)))]
-    found, _ = unseen_points(frames, cloud_of(frames), None, BASIS)
+    found, _ = at_rest(frames, cloud_of(frames))
     assert len(found) == 0
 
 
 def test_corners_around_a_round_picture_stay_empty() -> None:
     x, y = np.moveaxis(pixel_centers(WIDTH, HEIGHT), -1, 0)
     frames = [frame(0, (x - 160) ** 2 + (y - 120) ** 2 < 100**2)]
-    found, _ = unseen_points(frames, cloud_of(frames), None, BASIS)
+    found, _ = at_rest(frames, cloud_of(frames))
     pixels, _ = project(found.points.astype(np.float64), CAMERA)
     assert (np.linalg.norm(pixels - (160, 120), axis=1) < 100 + 2 * SIZE).all()
 
@@ -133,7 +137,7 @@ def test_new_points_move_as_those_around() -> None:
 
 def test_a_frame_without_tissue_adds_nothing() -> None:
     frames = [frame(0, np.ones((HEIGHT, WIDTH), bool)), frame(1, np.zeros((HEIGHT, WIDTH), bool))]
-    assert len(unseen_points(frames, cloud_of(frames), None, BASIS)[0]) == 0
+    assert len(at_rest(frames, cloud_of(frames))[0]) == 0
 
 
 def test_depth_along_the_rim_alone_is_enough() -> None:
@@ -142,5 +146,5 @@ def test_depth_along_the_rim_alone_is_enough() -> None:
     one_px_around = cv2.dilate((~tissue).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     depth = np.where(one_px_around, usual.depth, 0)
     bare = Frame(0, 0.0, CAMERA, usual.rgb_u8, tissue, depth, depth > 0)
-    found, _ = unseen_points([bare], cloud_of([bare]), None, BASIS)
+    found, _ = at_rest([bare], cloud_of([bare]))
     assert len(found) and np.isfinite(found.points).all() and (found.points[:, 2] > 0).all()

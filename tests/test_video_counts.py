@@ -9,7 +9,6 @@ import pytest
 from video_files import ffmpeg, moving_pattern
 
 from endoprior.core.checks import InputError
-from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.source import open_source
 
 H264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p"]
@@ -79,16 +78,19 @@ def test_avi_shows_the_images_at_an_even_rate_in_their_order(clips, name):
         assert np.abs(image.rgb_u8.astype(int) - want.rgb_u8).mean() < 5
 
 
+def cut_off(file, folder, share):
+    content = file.read_bytes()
+    (folder / file.name).write_bytes(content[: int(share * len(content))])
+    return folder / file.name
+
+
 @pytest.mark.parametrize("share", [0.5, 0.9])
 @pytest.mark.parametrize("name", INTACT)
 def test_a_file_cut_off_in_the_middle_is_rejected(clips, tmp_path, name, share):
     if (name, share) == ("clock_of_600.avi", 0.9):
         share = 0.6  # a third of the file is its index
-    content = (clips / name).read_bytes()
-    cut = tmp_path / name
-    cut.write_bytes(content[: int(share * len(content))])
     with pytest.raises(InputError, match=r"expected \d+ images, got \d+, then .*--end") as error:
-        list(open_source(cut))
+        list(open_source(cut_off(clips / name, tmp_path, share)))
     assert "\n" not in str(error.value)
 
 
@@ -99,17 +101,9 @@ def test_a_file_without_its_table_is_rejected(clips, tmp_path):
         list(open_source(at_end))
 
 
-@pytest.mark.parametrize(("name", "share"), [("whole.webm", 0.97), ("mjpeg.avi", 0.97)])
-def test_the_loss_of_the_last_image_is_noted(clips, tmp_path, name, share):
-    content = (clips / name).read_bytes()
-    cut = tmp_path / name
-    cut.write_bytes(content[: int(share * len(content))])
+@pytest.mark.parametrize("name", ["whole.webm", "mjpeg.avi"])
+def test_the_loss_of_the_last_image_is_noted(clips, tmp_path, name):
+    cut = cut_off(clips / name, tmp_path, 0.97)
     source = open_source(cut)
     assert len(list(source)) == 24
     assert source.notes == [f"{name} announces 25 images, 24 can be decoded; the last 0.04 s are missing"]
-
-
-def test_prepare_reports_both_numbers(clips, tmp_path):
-    cfg = PrepareConfig(border="keep", masks="none", depth="none", poses="still")
-    done = prepare(clips / "trimmed.mp4", tmp_path / "out", cfg)
-    assert done.num_frames == 39 and "trimmed.mp4 announces 92 images, 39 can be decoded" in done.notes

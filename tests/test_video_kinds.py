@@ -18,6 +18,11 @@ from endoprior.data.load import is_video
 from endoprior.prepare.decoding import Timeline, usual_rate
 from endoprior.prepare.source import open_source
 
+
+def lowest_psnr(found, images):
+    return min(psnr(image.rgb_u8, want) for image, want in zip(found, images, strict=True))
+
+
 # --- Pixels
 
 
@@ -35,9 +40,8 @@ def test_pixels_become_square(tmp_path, aspect, shown):
 
 def test_an_impossible_pixel_aspect_is_ignored_and_said(tmp_path):
     source = open_source(encode(tmp_path / "a.mp4", smooth(3), sample_aspect_ratio=Fraction(8, 1)))
-    assert source.width == 96 and source.notes == [
-        "a.mp4: the stated aspect ratio of pixels is not plausible and is ignored"
-    ]
+    said = "a.mp4: the stated aspect ratio of pixels is not plausible and is ignored"
+    assert source.width == 96 and source.notes == [said]
 
 
 @pytest.mark.parametrize("first", ["tff", "bff"])
@@ -72,12 +76,10 @@ def test_the_bits_in_use_fill_the_range(tmp_path):
         what = f"{bits}: images of 16 bits a channel: {bits} of 16 bits are in use, which become 0 to 255"
         assert source.notes == ([what] if bits > 8 else [])
 
-
-def test_the_brightest_image_decides_about_the_bits(tmp_path):
-    dark, bright = np.full((32, 32, 3), 600, np.uint16), np.full((32, 32, 3), 65535, np.uint16)
-    for index, image in enumerate([dark, dark, bright]):
-        cv2.imwrite(str(tmp_path / f"{index}.png"), image)
-    assert [int(image.rgb_u8[0, 0, 0]) for image in open_source(tmp_path)] == [2, 2, 255]
+    (tmp_path / "some").mkdir()
+    for index, level in enumerate([600, 600, 65535]):  # the brightest image decides
+        cv2.imwrite(str(tmp_path / f"some/{index}.png"), np.full((32, 32, 3), level, np.uint16))
+    assert [int(image.rgb_u8[0, 0, 0]) for image in open_source(tmp_path / "some")] == [2, 2, 255]
 
 
 # --- Time
@@ -96,11 +98,9 @@ def test_joined_streams_follow_each_other(tmp_path):
             source = open_source(both)
             found = list(source)
             assert [image.seconds for image in found] == pytest.approx(np.arange(30) / 25)
-            assert min(psnr(image.rgb_u8, want) for image, want in zip(found, images, strict=True)) > 25
-            assert not any(image.damaged for image in found)
-            assert (
-                f"both.{ending}: joined of 2 parts, each with times of its own; they follow each other" in source.notes
-            )
+            assert lowest_psnr(found, images) > 25 and not any(image.damaged for image in found)
+            said = f"both.{ending}: joined of 2 parts, each with times of its own; they follow each other"
+            assert said in source.notes
             assert len(source.times) == 30 and source.seconds == pytest.approx(30 / 25)
 
 
@@ -135,7 +135,7 @@ def test_times_of_fragments_that_start_again_lose_no_image(tmp_path, starts):
         content[place : place + 8] = int(start * length).to_bytes(8, "big")
     moved.write_bytes(content)
     found = list(open_source(moved))
-    assert min(psnr(image.rgb_u8, want) for image, want in zip(found, images, strict=True)) > 25
+    assert lowest_psnr(found, images) > 25
     assert min(np.diff([image.seconds for image in found])) > 0.039
 
 
@@ -256,8 +256,7 @@ def test_plain_streams_of_images_are_videos(tmp_path, name, codec, pixels):
     images = smooth(6)
     path = encode(tmp_path / name, images, codec, pixels)
     assert is_video(path)
-    found = list(open_source(path))
-    assert min(psnr(image.rgb_u8, want) for image, want in zip(found, images, strict=True)) > 28
+    assert lowest_psnr(list(open_source(path)), images) > 28
 
 
 def test_an_animated_webp_is_a_video(tmp_path):

@@ -5,12 +5,13 @@ The pictures are kept in `build/view/` to be looked at.
 
 import shutil
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from browser import open_page, pictures_folder, require_chromium
-from view_client import at_work
+from view_client import at_work, wait_until
 
 from endoprior.cli.view import open_viewable
 from endoprior.core.geometry import back_project
@@ -60,14 +61,19 @@ def viewer(scene, phantom, tmp_path):
         yield viewer
 
 
-@pytest.fixture
-def page(viewer):
-    """The page, once it shows an image. Afterwards its console must hold no error."""
+@contextmanager
+def opened(viewer):
+    """The page, once it shows an image."""
     with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
         page.wait_for("document.querySelector('[role=slider]') !== null")
-        end = time.monotonic() + 30
-        while canvas(page).std() < 20 and time.monotonic() < end:
-            time.sleep(0.2)
+        wait_until(lambda: canvas(page).std() > 20, 30)
+        yield page
+
+
+@pytest.fixture
+def page(viewer):
+    """The page. Afterwards its console must hold no error."""
+    with opened(viewer) as page:
         yield page
     assert not unexpected(page.problems)
 
@@ -103,12 +109,12 @@ def press_button(page, text: str) -> None:
     page.evaluate(f"{found}.click()")
 
 
-def wait_until(condition, seconds: float = 15) -> None:
-    """Until it is true."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.02)
+def go_to_frame(viewer, page) -> None:
+    """To FRAME, by the keys of the slider."""
+    page.evaluate("document.querySelector('[role=slider]').focus()")
+    for _ in range(FRAME):
+        page.press("ArrowRight")
+    wait_until(lambda: viewer.settings.frame == FRAME)
 
 
 def choose(viewer, handle, value) -> None:
@@ -121,10 +127,7 @@ def choose(viewer, handle, value) -> None:
 
 def test_the_slider_changes_the_image_and_play_advances(viewer, page, scene):
     first = settled(page, "first_frame")
-    page.evaluate("document.querySelector('[role=slider]').focus()")
-    for _ in range(FRAME):
-        page.press("ArrowRight")
-    wait_until(lambda: viewer.settings.frame == FRAME)
+    go_to_frame(viewer, page)
     assert np.abs(settled(page, "slider_moved") - first).mean() > 2
     press_button(page, "Play")
     seen = set()
@@ -135,10 +138,7 @@ def test_the_slider_changes_the_image_and_play_advances(viewer, page, scene):
 
 
 def test_two_clicks_measure_the_true_distance(viewer, page, phantom):
-    page.evaluate("document.querySelector('[role=slider]').focus()")
-    for _ in range(FRAME):
-        page.press("ArrowRight")
-    wait_until(lambda: viewer.settings.frame == FRAME)
+    go_to_frame(viewer, page)
     choose(viewer, viewer.panel.measure, True)
     settled(page)
     left, top, width, height = page.box("canvas")
@@ -149,22 +149,19 @@ def test_two_clicks_measure_the_true_distance(viewer, page, phantom):
         for column, row in pair:
             assert truth[row, column] > 0
             points.append(back_project(np.array([column + 0.5, row + 0.5]), truth[row, column], frame.camera))
-            before = viewer.measured
+            before = viewer.measuring.measured
             x, y = viewport.screen((column + 0.5, row + 0.5))
             page.click_at(left + x * width, top + y * height)
-            wait_until(lambda before=before: viewer.measured is not before)
+            wait_until(lambda before=before: viewer.measuring.measured is not before)
         true = float(np.linalg.norm(points[1] - points[0]))
-        assert viewer.measured.curve("Distance")[FRAME] == pytest.approx(true, abs=1.0)
-        distance = viewer.measured.curve("Distance")[FRAME]
+        assert viewer.measuring.measured.curve("Distance")[FRAME] == pytest.approx(true, abs=1.0)
+        distance = viewer.measuring.measured.curve("Distance")[FRAME]
         page.wait_for(f"document.body.innerText.includes('{distance:.2f} mm')")
     settled(page, "measured")
 
 
 def test_layers_tracks_tool_and_orbit(viewer, page):
-    page.evaluate("document.querySelector('[role=slider]').focus()")
-    for _ in range(FRAME):
-        page.press("ArrowRight")
-    wait_until(lambda: viewer.settings.frame == FRAME)
+    go_to_frame(viewer, page)
     images = {}
     for layer, name in LAYER_NAMES.items():
         choose(viewer, viewer.panel.layer, name)
@@ -186,9 +183,7 @@ def test_layers_tracks_tool_and_orbit(viewer, page):
 
 
 def test_the_browser_renders_like_the_server(viewer):
-    with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
-        page.wait_for("document.querySelector('[role=slider]') !== null")
-        wait_until(lambda: canvas(page).std() > 20, 30)
+    with opened(viewer) as page:
         ours = settled(page)
         choose(viewer, viewer.panel.rendered_by, BROWSER)
         wait_until(lambda: viewer.settings.in_browser)
@@ -201,9 +196,7 @@ def test_the_browser_renders_like_the_server(viewer):
 
 def test_a_raw_sequence(phantom):
     viewable, _ = open_viewable(phantom.path, None)
-    with at_work(Viewer(viewable)) as viewer, open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
-        page.wait_for("document.querySelector('[role=slider]') !== null")
-        wait_until(lambda: canvas(page).std() > 20, 30)
+    with at_work(Viewer(viewable)) as viewer, opened(viewer) as page:
         seen = settled(page, "sequence_frame")
         choose(viewer, viewer.panel.camera, ORBIT)
         time.sleep(2)
@@ -215,9 +208,7 @@ def test_a_raw_sequence(phantom):
 def test_masks_are_painted_by_dragging_carried_and_saved(phantom, tmp_path):
     folder = shutil.copytree(phantom.path, tmp_path / "data")
     viewable, _ = open_viewable(folder, None)
-    with at_work(Viewer(viewable)) as viewer, open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
-        page.wait_for("document.querySelector('[role=slider]') !== null")
-        wait_until(lambda: canvas(page).std() > 20, 30)
+    with at_work(Viewer(viewable)) as viewer, opened(viewer) as page:
         viewer.panel.correct.value = True
         viewer.jobs.put(viewer.read_panel)
         wait_until(lambda: viewer.settings.correcting)

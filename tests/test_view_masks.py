@@ -9,16 +9,15 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from view_client import Client, at_work
+from view_client import Client, at_work, wait_until
 
 from endoprior.cli.view import open_viewable
 from endoprior.core.checks import InputError
 from endoprior.data import folder_edits, load_sequence
 from endoprior.tool_masks.clicked_tools import SearchStep, ToolClick, check_clicks
 from endoprior.view import layers
-from endoprior.view.job_queue import JobQueue
-from endoprior.view.mask_editor import MaskEditor
-from endoprior.view.mask_edits import MaskEdits, stroke
+from endoprior.view.access_control import JobQueue
+from endoprior.view.mask_editor import MaskEditor, MaskEdits, stroke
 from endoprior.view.server import Viewer
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_sequence import ViewableSequence
@@ -37,14 +36,6 @@ def tool(folder, name: str) -> np.ndarray:
     pixels = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
     assert set(np.unique(pixels)) <= {0, 255}
     return pixels == 255
-
-
-def wait_until(condition, seconds: float = 10) -> None:
-    """Until it is true."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize("points", [[(20.5, 30.5)], [(10.0, 12.0), (50.0, 30.0)], [(5, 5), (40, 9), (30, 44)]])
@@ -175,7 +166,7 @@ def found_in(monkeypatch, frames: dict[int, tuple[slice, slice]], clicks: list) 
                 added[frames[i]] = True
             yield SearchStep(i + 1, total, i, added)
 
-    monkeypatch.setattr("endoprior.view.mask_edits.find_clicked", steps)
+    monkeypatch.setattr("endoprior.view.mask_editor.find_clicked", steps)
 
 
 def test_a_search_is_one_edit_that_can_be_undone_and_saved(edits, monkeypatch, tiny_sequence):
@@ -256,7 +247,7 @@ def test_an_error_ends_a_search(edits, monkeypatch):
         yield SearchStep(1, 9)
         raise OSError("no such frame")
 
-    monkeypatch.setattr("endoprior.view.mask_edits.find_clicked", broken)
+    monkeypatch.setattr("endoprior.view.mask_editor.find_clicked", broken)
     editor.find(0, (3.0, 3.0))
     with pytest.raises(OSError, match="no such frame"):
         [job() for job in jobs.take(0)]

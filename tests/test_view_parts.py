@@ -11,12 +11,19 @@ from endoprior.core.geometry import project
 from endoprior.core.types import Camera
 from endoprior.data.images import encode_png
 from endoprior.view.browsers import Browsers
-from endoprior.view.layers import concatenated, draw_lines, no_lines, render_points, ruler, track_lines
+from endoprior.view.layers import NO_LINES, draw_lines, render_points, ruler, track_lines
 from endoprior.view.measure import Measurement, measurement_text, pick
 from endoprior.view.panel import POINTS_OF
-from endoprior.view.saving import PathPoint, follow_frames, interpolate, keep, mp4_bytes
+from endoprior.view.server import keep, mp4_bytes
 from endoprior.view.viewable import frame_due, shrink_factor
-from endoprior.view.viewport import bounded_aspect, endoscope_viewport, free_viewport
+from endoprior.view.viewport import (
+    PathPoint,
+    bounded_aspect,
+    endoscope_viewport,
+    follow_frames,
+    free_viewport,
+    interpolate,
+)
 
 CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
 OFF_CENTER = Camera(64, 48, 80.0, 80.0, 30.0, 27.0, np.eye(4))
@@ -99,7 +106,7 @@ def test_track_lines_end_at_the_frame_and_skip_unknown_points():
 
 def test_lines_are_drawn_at_their_projection():
     ends = np.array([[-5.0, 0, 50], [5, 0, 50]])
-    marks = concatenated(no_lines(), ruler(ends))
+    marks = NO_LINES + ruler(ends)
     picture = draw_lines(np.zeros((48, 64, 3), np.uint8), CAMERA, marks)
     rows, columns = np.nonzero(picture.any(-1))
     assert abs(rows.mean() - 23.5) < 0.6 and 19 <= columns.min() and columns.max() <= 44

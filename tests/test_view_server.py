@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from view_client import Client, at_work
+from view_client import Client, at_work, wait_until
 
 from endoprior.cli.view import live_view, open_viewable
 from endoprior.core.config import Config
@@ -128,15 +128,15 @@ def test_two_clicks_measure_and_the_distance_follows_the_tissue(viewer, client, 
     for x in (0.25, 0.75):
         client.click(x, 0.5)
     client.image()
-    assert viewer.measured.curve("Distance") == pytest.approx(np.full(NUM_FRAMES, 32 / 80 * 50), abs=0.05)
+    assert viewer.measuring.measured.curve("Distance") == pytest.approx(np.full(NUM_FRAMES, 32 / 80 * 50), abs=0.05)
     assert "mm" in viewer.panel.distance.content
-    shift = viewer.measured.paths[-1, 0, 0] - viewer.measured.paths[0, 0, 0]
+    shift = viewer.measuring.measured.paths[-1, 0, 0] - viewer.measuring.measured.paths[0, 0, 0]
     moved = scene.at((NUM_FRAMES - 1) / NUM_FRAMES).means - scene.at(0).means
     assert shift == pytest.approx(float(moved[0, 0]), abs=1e-3) and shift > 1
     client.click(1.5, 0.5)
     client.click(np.nan, 0.5)
     time.sleep(0.5)
-    assert viewer.measured.paths.shape[1] == 2  # clicks on nothing change nothing
+    assert viewer.measuring.measured.paths.shape[1] == 2  # clicks on nothing change nothing
 
 
 def test_a_click_in_any_frame_starts_a_track(viewer, client, scene):
@@ -146,7 +146,7 @@ def test_a_click_in_any_frame_starts_a_track(viewer, client, scene):
     time.sleep(0.3)
     client.click(0.5, 0.5)
     marked = client.image()
-    assert len(viewer.tracks.picked) == 1 and viewer.measured is None
+    assert len(viewer.tracks.picked) == 1 and viewer.measuring.measured is None
     (track,) = viewer.tracks.picked
     assert track.positions[3, 0] == pytest.approx([0, 0, 50], abs=0.7)
     moved = scene.at((NUM_FRAMES - 1) / NUM_FRAMES).means - scene.at(0).means
@@ -181,25 +181,27 @@ def test_every_quantity_is_measured_and_saved_as_a_table(viewer, client):
     for at in ((0.3, 0.4), (0.7, 0.4), (0.7, 0.6), (0.3, 0.6)):
         client.click(*at)
     client.image()
-    assert viewer.measured.curve(AREA) == pytest.approx(np.full(NUM_FRAMES, 16 * 6.5), rel=0.02)  # canvas 64 x 52 px
+    assert viewer.measuring.measured.curve(AREA) == pytest.approx(
+        np.full(NUM_FRAMES, 16 * 6.5), rel=0.02
+    )  # canvas 64 x 52 px
     assert "mm²" in viewer.panel.distance.content and viewer.panel.chart.visible
     client.set(viewer.panel.since, 2)
     client.set(viewer.panel.quantity, STRETCH)
     client.image()
-    assert viewer.measured.curve(STRETCH) == pytest.approx(np.ones(NUM_FRAMES), abs=0.01)  # the wall slides as a whole
-    assert viewer.measured.curve(DISPLACEMENT)[2] == 0 < viewer.measured.curve(DISPLACEMENT)[4]
+    assert viewer.measuring.measured.curve(STRETCH) == pytest.approx(
+        np.ones(NUM_FRAMES), abs=0.01
+    )  # the wall slides as a whole
+    assert viewer.measuring.measured.curve(DISPLACEMENT)[2] == 0 < viewer.measuring.measured.curve(DISPLACEMENT)[4]
     client.set(viewer.panel.table, True)
-    end = time.monotonic() + 10
-    while not list(viewer.out.glob("measures*.csv")) and time.monotonic() < end:
-        time.sleep(0.05)
+    wait_until(lambda: list(viewer.out.glob("measures*.csv")))
     rows = list(csv.DictReader((viewer.out / "measures_1.csv").read_text().splitlines()))
     assert len(rows) == NUM_FRAMES and float(rows[1]["area_mm2"]) == pytest.approx(
-        viewer.measured.curve(AREA)[1], abs=1e-3
+        viewer.measuring.measured.curve(AREA)[1], abs=1e-3
     )
     client.set(viewer.panel.clear, True)
     client.set(viewer.panel.table, True)
     time.sleep(0.3)
-    assert viewer.measured is None and len(list(viewer.out.iterdir())) == 1
+    assert viewer.measuring.measured is None and len(list(viewer.out.iterdir())) == 1
 
 
 def test_displacement_and_stretch_are_since_the_reference_frame(scene):
@@ -231,11 +233,8 @@ def test_each_gaussian_has_a_color_also_behind_the_camera(scene):
 def test_play_advances_and_pauses(viewer, client):
     client.set(viewer.panel.speed, "0.5x")
     client.set(viewer.panel.play, True)
-    seen, end = set(), time.monotonic() + 3
-    while len(seen) < 4 and time.monotonic() < end:
-        seen.add(viewer.settings.frame)
-        time.sleep(0.01)
-    assert len(seen) >= 4
+    seen = set()
+    wait_until(lambda: seen.add(viewer.settings.frame) or len(seen) >= 4, 3)
     client.set(viewer.panel.play, True)
     client.image()
     at = viewer.settings.frame
@@ -266,9 +265,7 @@ def test_screenshot_and_video_are_stored_in_the_run(viewer, client):
     client.set(viewer.panel.frame, 3)
     client.set(viewer.panel.keep, True)
     client.set(viewer.panel.video, True)
-    end = time.monotonic() + 20
-    while not list(viewer.out.glob("color*.mp4")) and time.monotonic() < end:
-        time.sleep(0.05)
+    wait_until(lambda: list(viewer.out.glob("color*.mp4")), 20)
     assert sorted(path.name for path in viewer.out.iterdir()) == ["color_000000_1.png", "color_1.mp4"]
 
 
@@ -301,7 +298,9 @@ def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
         for x in (0.45, 0.55):
             client.click(x, 0.7)
         time.sleep(0.5)
-        assert np.isfinite(viewer.measured.curve("Distance")).sum() == 1  # the motion of the points is unknown
+        assert (
+            np.isfinite(viewer.measuring.measured.curve("Distance")).sum() == 1
+        )  # the motion of the points is unknown
         client.socket.close()
 
 

@@ -41,13 +41,6 @@ def test_round_trip(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
-def test_an_empty_folder_is_taken_over(tmp_path):
-    (tmp_path / "out").mkdir()
-    with new_sequence(tmp_path / "out", META) as writer:
-        writer.add(image(), np.zeros((4, 6), bool))
-    assert (tmp_path / "out/images/000000.png").exists() and not (tmp_path / "out/depth").exists()
-
-
 def test_nothing_is_left_after_an_error(tmp_path):
     with pytest.raises(RuntimeError), new_sequence(tmp_path / "deep/out", META) as writer:
         writer.add(image(), np.zeros((4, 6), bool))

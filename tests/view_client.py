@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -21,6 +22,13 @@ from endoprior.view.panel import control_id
 VISER = "viser-v1.1.1"
 
 
+def camera_message(**changes: Any) -> dict[str, Any]:
+    """The message with the position of a browser's camera."""
+    camera = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "look_at": [0, 0, 60], "up_direction": [0, -1, 0]}
+    size = {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
+    return {"type": "ViewerCameraMessage", **camera, **size, **changes}
+
+
 class Client:
     """The browser's side of one connection to the page at `url`: a canvas of 600 x 480 px."""
 
@@ -30,13 +38,11 @@ class Client:
 
     def send_camera(self, **changes: Any) -> None:
         """Send the position of its camera."""
-        camera = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "look_at": (0, 0, 60), "up_direction": (0, -1, 0)}
-        camera |= {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
-        self.send("ViewerCameraMessage", **camera | changes)
+        self.send(**camera_message(**changes))
 
-    def send(self, kind: str, **fields: Any) -> None:
+    def send(self, type: str, **fields: Any) -> None:
         """Send one message."""
-        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+        self.socket.send(msgspec.msgpack.encode({"type": type, **fields}))
 
     def set(self, handle: Any, value: Any) -> None:
         """Change a control of the panel."""
@@ -95,6 +101,14 @@ class Client:
 
 def _decoded(data: bytes) -> NDArray[np.uint8]:
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 15) -> None:
+    """Until it is true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
 
 
 @contextmanager

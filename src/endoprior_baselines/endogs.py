@@ -30,8 +30,8 @@ from endoprior.training.gaussian_method import GaussianMethod, in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
-from endoprior.training.stage import Stage
 from endoprior.training.step import Drawn
+from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
 

@@ -25,13 +25,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
-from endoprior.compute.exponential import power_of_two
 from endoprior.compute.simd import (
     LANES,
     fma,
     largest,
     load_some,
     magnitude,
+    power_of_two,
     splat,
     square_root,
     store,

@@ -19,8 +19,8 @@ from torch.autograd.function import once_differentiable
 
 from endoprior.compute.fastmath import REORDERED
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid
-from endoprior.training.stage import Stage
 from endoprior.training.step import Drawn
+from endoprior.training.trainer import Stage
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ from endoprior.training.gaussian_method import GaussianMethod, in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_linear, rate_of
-from endoprior.training.stage import Stage
 from endoprior.training.step import Drawn
+from endoprior.training.trainer import Stage
 
 from .surface_points import grid_points
 from .time_network import TimeNetwork, state_shapes

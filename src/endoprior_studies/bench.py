@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from endoprior.cli.arguments import Help, parse
+from endoprior.cli.arguments import Command, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
 
@@ -18,7 +18,7 @@ MOST_CORES = 4096
 
 
 @dataclass
-class Bench:
+class Bench(Command):
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
     spec: str = field(metadata={"place": "SPEC"})
@@ -43,15 +43,14 @@ class Bench:
     report_only: bool = False
     """Train nothing; write the report of the finished cells."""
 
-
-HELP = Help(examples=(("quick", "OUT"), ("sized", "OUT", "--report-only")))
+    examples = ("quick OUT", "sized OUT --report-only")
 
 
 def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
     if argv[:1] == ["masks"]:
         return bench_masks.run(argv[1:])
-    args = parse(Bench, argv, "bench", HELP)
+    args = parse(Bench, argv, "bench")
     from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
 

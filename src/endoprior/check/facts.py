@@ -29,25 +29,21 @@ from ..footage.overlays import find_static_overlays
 from ..footage.polarity import Polarity, mask_polarity
 from ..footage.pose_fit import PoseFit, View, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
+from ..footage.units import FAR_MM, UnitGuess, guess_unit
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
-from .depth_facts import DepthFacts, measure_depth
 
 if TYPE_CHECKING:
     from ..initialization.sampling import PointCloud
 
-SAMPLES = 20
-"""Number of evenly spaced frames for expensive measurements."""
-MOTION_FRAMES = 300
-"""Largest number of frames for the camera motion."""
-CERTAIN = 0.5
-"""Least certainty to report masks as inverted."""
-POINT_FRAMES = 24
-"""Largest number of training frames for the initial points."""
-LABEL_ON_TISSUE = 0.75
-"""Least share of a text box that the masks mark as tissue."""
-COMPARED = 3
-"""Number of stereo pairs to compare, evenly spaced."""
+SAMPLES = 20  # evenly spaced frames for expensive measurements
+MOTION_FRAMES = 300  # largest number of frames for the camera motion
+CERTAIN = 0.5  # least certainty to report masks as inverted
+POINT_FRAMES = 24  # largest number of training frames for the initial points
+LABEL_ON_TISSUE = 0.75  # least share of a text box that the masks mark as tissue
+COMPARED = 3  # stereo pairs to compare, evenly spaced
+BINS = 80  # of the histogram of depth
+EVERY = 7  # the distribution of depth uses every 7th pixel
 Mask = NDArray[np.bool_]
 
 
@@ -55,10 +51,8 @@ Mask = NDArray[np.bool_]
 class MaskFacts:
     """Masks as read; every pixel that is neither tissue nor border is tool."""
 
-    tool_fraction: NDArray[np.float64]
-    """(T,) share of tool pixels inside the masked border."""
-    polarity: Polarity
-    """Polarity of the masks as read: `tool_is_high` False means that tissue and tool are swapped."""
+    tool_fraction: NDArray[np.float64]  # (T,) share of tool pixels inside the masked border
+    polarity: Polarity  # of the masks as read: `tool_is_high` False means that tissue and tool are swapped
     confidence: NDArray[np.float64]
     """(T,) how sure the program was that found them, 0..1; NaN where no program did, or a person corrected them."""
 
@@ -77,7 +71,7 @@ class MaskFacts:
         """The measurements in one line."""
         return self.polarity.reason.replace("high values cover", "pixels read as tool cover")
 
-    def tissue(self, frame: Frame) -> NDArray[np.bool_]:
+    def tissue(self, frame: Frame) -> Mask:
         """(H, W) True on the tissue of a frame; inverted masks are corrected."""
         return ~frame.tissue_mask if self.inverted else frame.tissue_mask
 
@@ -86,14 +80,10 @@ class MaskFacts:
 class BorderFacts:
     """Borders around the endoscope image, and how much of them the masks mark as tissue."""
 
-    strips: Strips
-    """Static or black strips at the sides, px."""
-    strips_as_tissue: float
-    """Share of the strips' pixels that are marked as tissue; 0 without strips."""
-    circle: Circle | None
-    """Round border of the endoscope image."""
-    outside_as_tissue: float
-    """Share of the pixels outside the circle that are marked as tissue; 0 without a circle."""
+    strips: Strips  # static or black strips at the sides, px
+    strips_as_tissue: float  # share of the strips' pixels that are marked as tissue; 0 without strips
+    circle: Circle | None  # round border of the endoscope image
+    outside_as_tissue: float  # share of the pixels outside the circle that are marked as tissue; 0 without a circle
     overlays: tuple[tuple[int, int, int, int], ...]
     """x, y, width, height of burned-in labels that are marked as tissue, px."""
     masked: Mask
@@ -101,13 +91,29 @@ class BorderFacts:
 
 
 @dataclass(frozen=True)
+class DepthFacts:
+    """Depth as read; in mm if the folder states the right unit. Statistics are of tissue, 0 without depth there."""
+
+    coverage: NDArray[np.float64]  # (T,) share of tissue pixels with depth
+    median: NDArray[np.float64]  # (T,) NaN in a frame without any
+    far: NDArray[np.float64]  # (T,) share of the tissue pixels with depth that are farther than `FAR_MM`
+    low: float  # 1st percentile
+    high: float  # 99th percentile
+    edges: NDArray[np.float64]  # (81,) of the histogram bins
+    counts: NDArray[np.int64]  # (80,) sampled tissue pixels in each bin
+    step: float  # median difference between neighboring values of a frame
+    bits: int | None  # per stored value; None if unknown
+    scale: float  # mm per stored unit: the option, else the value in `sequence.json`, else 1
+    unit: UnitGuess
+    relative: bool  # whether the folder states that its scale is unknown
+
+
+@dataclass(frozen=True)
 class StereoFacts:
     """Consistency of the left and right images."""
 
-    order: StereoOrder
-    """Share of the image that matches in either order, mean over the compared frames."""
-    vertical_px: float
-    """Median vertical offset of matching features, px, >= 0; NaN if there are too few matches."""
+    order: StereoOrder  # share of the image that matches in either order, mean over the compared frames
+    vertical_px: float  # median vertical offset of matching features, px, >= 0; NaN if there are too few matches
 
     @property
     def reason(self) -> str:
@@ -121,45 +127,30 @@ class Facts:
     """All measurements of a sequence."""
 
     path: Path
-    frames: int
-    """T."""
+    frames: int  # T
     train_frames: int
     test_frames: int
     frames_per_second: float | None
-    camera: Camera
-    """Camera of the first frame."""
-    described: dict[str, Any]
-    """Content of `sequence.json`; empty without one."""
-    sources: dict[str, str]
-    """Where each part comes from, if the folder states it."""
-    takes_masks: bool
-    """Whether masks that a person paints are read; some layouts have none."""
-    notes: tuple[str, ...]
-    """Notes of the reader, one line each."""
-    camera_path_mm: float
-    """Largest distance of a stored camera from the first one."""
-    camera_turn_deg: float
-    """Largest rotation of a stored camera from the first one."""
-    motion: CameraMotion
-    """Motion of the image as a whole."""
-    motion_step: int
-    """Distance between the frames compared by `motion`."""
+    camera: Camera  # of the first frame
+    described: dict[str, Any]  # content of `sequence.json`; empty without one
+    sources: dict[str, str]  # where each part comes from, if the folder states it
+    takes_masks: bool  # whether masks that a person paints are read; some layouts have none
+    notes: tuple[str, ...]  # of the reader, one line each
+    camera_path_mm: float  # largest distance of a stored camera from the first one
+    camera_turn_deg: float  # largest rotation of a stored camera from the first one
+    motion: CameraMotion  # of the image as a whole
+    motion_step: int  # distance between the frames compared by `motion`
     windows: tuple[tuple[int, int], ...]
     """First frame, and the frame after the last one, of each window that `train` would cut the sequence into."""
-    pose_fit: PoseFit | None
-    """How well the stored poses explain the images; None for a static camera."""
+    pose_fit: PoseFit | None  # how well the stored poses explain the images; None for a static camera
     changes: Changes
     masks: MaskFacts
     border: BorderFacts
     depth: DepthFacts
-    stereo: StereoFacts | None
-    """None without right images."""
-    cloud: PointCloud | None
-    """Initial points from at most 24 training frames; None if there are none."""
-    data: DataConfig
-    """Options with which the sequence was opened."""
-    record: PrepareRecord | None
-    """How `prepare` made the folder, if it did."""
+    stereo: StereoFacts | None  # None without right images
+    cloud: PointCloud | None  # initial points from at most 24 training frames; None if there are none
+    data: DataConfig  # options with which the sequence was opened
+    record: PrepareRecord | None  # how `prepare` made the folder, if it did
 
     @property
     def camera_is_fixed(self) -> bool:
@@ -173,14 +164,7 @@ class Facts:
 
 
 def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
-    """Measure a sequence. Every frame is decoded and cached, as in training.
-
-    Args:
-        sequence: as training reads it.
-        cfg: options with which it was opened.
-    Raises:
-        InputError: a file cannot be used.
-    """
+    """Measure a sequence that was opened with these options. Every frame is decoded and cached, as in training."""
     cfg = cfg or DataConfig()
     count = len(sequence)
     frames = sequence.frames("video")
@@ -190,9 +174,8 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
     outline = find_outline(images)
     masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
     view = max(int((~masked).sum()), 1)
-    masks = MaskFacts(
-        np.array([1 - frame.tissue_mask.sum() / view for frame in frames]), polarity, _confidence(sequence)
-    )
+    tool_fraction = np.array([1 - frame.tissue_mask.sum() / view for frame in frames])
+    masks = MaskFacts(tool_fraction, polarity, _confidence(sequence))
     tissue = [masks.tissue(frame) for frame in samples]
     step = -(-count // MOTION_FRAMES)
     followed = [sequence.frame(i) for i in range(0, count, step)]
@@ -205,7 +188,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         train_frames=len(sequence.indices("train")),
         test_frames=len(sequence.indices("test")),
         frames_per_second=sequence.frames_per_second,
-        camera=sequence.camera(0),
+        camera=cameras[0],
         described=described,
         sources=dict(sequence.sources),
         takes_masks=sequence.takes_masks,
@@ -219,7 +202,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         changes=find_changes(frame.rgb_u8 for frame in frames),
         masks=masks,
         border=_border(outline, images, tissue, masked),
-        depth=measure_depth(sequence, samples, tissue, described, cfg),
+        depth=_depth(sequence, samples, tissue, described, cfg),
         stereo=_stereo(sequence),
         cloud=_first_points(sequence),
         data=cfg,
@@ -249,7 +232,7 @@ def _camera_path(cameras: list[Camera]) -> tuple[float, float]:
 
 def _first_points(sequence: FrameSequence) -> PointCloud | None:
     train = sequence.frames("train")
-    frames = [train[i] for i in spread(len(train), POINT_FRAMES)]
+    frames = [train[int(i)] for i in spread(len(train), POINT_FRAMES)]
     if not any((frame.tissue_mask & frame.depth_valid).any() for frame in frames):
         return None
     try:
@@ -259,32 +242,64 @@ def _first_points(sequence: FrameSequence) -> PointCloud | None:
 
 
 def _border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: list[Mask], masked: Mask) -> BorderFacts:
-    """Measure how the masks mark the outline and the labels.
+    """How the masks of the samples, corrected if inverted, mark the outline and the labels."""
+    tissue, border = np.mean(tissue_masks, axis=0), outline.in_strip | outline.outside
 
-    Args:
-        images, tissue_masks: of the samples; inverted masks are corrected.
-        masked: from `footage.border.masked_border`.
-    """
-    tissue = np.mean(tissue_masks, axis=0)
+    def is_label(box: tuple[int, int, int, int]) -> bool:
+        """Whether a text box lies inside the border, and the masks mark most of it as tissue."""
+        x, y, width, height = box
+        inside = slice(y, y + height), slice(x, x + width)
+        return _mean(tissue[inside]) > LABEL_ON_TISSUE and _mean(border[inside]) < 0.5
+
     return BorderFacts(
         outline.strips,
         _mean(tissue[outline.in_strip]),
         outline.circle,
         _mean(tissue[outline.outside]),
-        tuple(b for b in find_static_overlays(images) if _is_label(b, tissue, outline.in_strip | outline.outside)),
+        tuple(filter(is_label, find_static_overlays(images))),
         masked,
     )
 
 
-def _is_label(box: tuple[int, int, int, int], tissue: NDArray[np.floating], border: Mask) -> bool:
-    """Whether a text box lies inside the border, and the masks mark most of it as tissue."""
-    x, y, width, height = box
-    inside = slice(y, y + height), slice(x, x + width)
-    return _mean(tissue[inside]) > LABEL_ON_TISSUE and _mean(border[inside]) < 0.5
-
-
 def _mean(values: NDArray) -> float:
     return float(values.mean()) if values.size else 0.0
+
+
+def _depth(
+    sequence: FrameSequence, samples: list[Frame], tissue: list[Mask], described: dict[str, Any], cfg: DataConfig
+) -> DepthFacts:
+    """Coverage and median of every frame, and the distribution over the samples, of which this is the tissue."""
+    coverage, median, far = [], [], []
+    for frame in sequence.frames("video"):
+        on_tissue = frame.depth_valid & frame.tissue_mask
+        coverage.append(float(on_tissue.sum() / max(frame.tissue_mask.sum(), 1)))
+        values = frame.depth[on_tissue]
+        median.append(float(np.median(values[::EVERY])) if len(values) else float("nan"))
+        far.append(_mean(values > FAR_MM))
+    pairs = list(zip(samples, tissue, strict=True))
+    values = np.concatenate([frame.depth[frame.depth_valid & mask][::EVERY] for frame, mask in pairs])
+    low, high = (float(v) for v in np.percentile(values, (1, 99))) if len(values) else (0.0, 0.0)
+    margin = 0.1 * (high - low) or 0.1 * high or 1.0
+    counts, edges = np.histogram(values, BINS, (max(low - margin, 0), high + margin))
+    steps = [np.diff(np.unique(frame.depth[frame.depth_valid])) for frame in samples]
+    usual = [float(np.median(step)) for step in steps if len(step)]
+    header = b""
+    if png := min((sequence.path / "depth").glob("*.png"), default=None):
+        header = png.read_bytes()[:26]
+    return DepthFacts(
+        np.array(coverage),
+        np.array(median),
+        np.array(far),
+        low,
+        high,
+        edges,
+        counts,
+        step=float(np.median(usual)) if usual else 0.0,
+        bits=header[24] if len(header) == 26 else None,
+        scale=float(cfg.depth_unit_mm or described.get("depth_scale") or 1.0),
+        unit=guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in pairs),
+        relative=sequence.depth_is_relative,
+    )
 
 
 def _pose_fit(sequence: FrameSequence) -> PoseFit | None:
@@ -296,18 +311,13 @@ def _pose_fit(sequence: FrameSequence) -> PoseFit | None:
         return frame.rgb_u8, frame.tissue_mask, np.where(frame.depth_valid, frame.depth, np.float32(0))
 
     matrix = np.array([[first.fx, 0, first.cx - 0.5], [0, first.fy, first.cy - 0.5], [0, 0, 1]])
-    poses = np.linalg.inv(np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))]))
+    stored = np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))])
+    poses = np.linalg.inv(stored).astype(np.float64)
     return measure_poses(view, matrix, poses, relative=sequence.depth_is_relative)
 
 
 def _stereo(sequence: FrameSequence) -> StereoFacts | None:
-    """Compare both cameras in a few frames; None without a right image for each frame.
-
-    Args:
-        sequence: its folder may have `right/`, with one PNG for each of its frames.
-    Raises:
-        InputError: a right image cannot be read, or has another size.
-    """
+    """Compare both cameras in a few frames; None unless the folder has a right PNG of that size for each frame."""
     files = in_order((sequence.path / "right").glob("*.png"))
     camera, count = sequence.camera(0), len(sequence)
     if len(files) != count or read_color(files[0]).shape[:2] != (camera.height, camera.width):
@@ -317,7 +327,6 @@ def _stereo(sequence: FrameSequence) -> StereoFacts | None:
         for i in np.linspace(0, count - 1, COMPARED).round()
     ]
     orders = [stereo_order(*pair) for pair in pairs]
-    offsets = [vertical_offset_px(*pair) for pair in pairs]
-    known = [offset for offset in offsets if np.isfinite(offset)]
     mean = StereoOrder(*(float(np.mean([getattr(o, name) for o in orders])) for name in ("as_given", "exchanged")))
+    known = [offset for offset in (vertical_offset_px(*pair) for pair in pairs) if np.isfinite(offset)]
     return StereoFacts(mean, float(np.median(known)) if known else float("nan"))

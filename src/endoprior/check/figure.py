@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Patch, Rectangle
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit, project
@@ -27,36 +27,26 @@ from .facts import Facts
 from .findings import SEEN_AS_TISSUE, Finding
 from .report import table, unit_reason
 
-SHOWN = 4
-"""Number of frames shown."""
-MOST_UNSURE = 6
-"""Largest number of frames shown whose masks are uncertain."""
-UNSURE_HEIGHT = 2.2
-"""Of their row in the figure, inches."""
-RULER_MM = 10.0
-"""Length of the ruler, at the median depth of the frame."""
+SHOWN = 4  # Number of frames shown
+MOST_UNSURE = 6  # Largest number of frames shown whose masks are uncertain
+UNSURE_HEIGHT = 2.2  # Of their row in the figure, inches
+RULER_MM = 10.0  # Length of the ruler, at the median depth of the frame
 TOOL_COLOR, BORDER_COLOR, FLAG_COLOR = "#ff3b30", "#ffd60a", "#d62728"
-WRAPPED_AT, ROWS = 84, 34
-"""Characters per line and number of lines of the findings panel."""
-LABEL_WIDTH = 70
-"""Characters per line below the histogram."""
+WRAPPED_AT, ROWS = 84, 34  # Characters per line and number of lines of the findings panel
+LABEL_WIDTH = 70  # Characters per line below the histogram
 SEVERITY_COLOR = {"error": "#b00020", "warning": "#b26a00", "note": "#3a5a78"}
 
 
 def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], path: Path) -> None:
-    """Write the figure as a PNG file.
+    """Write the figure of a measured sequence as a PNG file, completely or not at all.
 
     Rows: frames with tools outlined in red and borders in yellow; their depth; depth histogram and curves over time,
     with the frames of findings marked; initial points from the camera and from the side, and the findings; the frames
     whose masks are least certain, if there are uncertain ones.
-
-    Args:
-        sequence: the measured sequence.
-        facts, findings: its facts and findings.
-        path: the file; written completely or not at all.
     """
     # Use a canvas directly: selecting a Matplotlib backend would change the whole process.
-    unsure = least_certain(facts)
+    confidence = facts.masks.confidence
+    unsure = sorted(facts.masks.uncertain, key=lambda i: (confidence[i], i))[:MOST_UNSURE]
     figure = Figure(figsize=(15, 14 + UNSURE_HEIGHT * bool(unsure)), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     camera = facts.camera
@@ -65,9 +55,9 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     title = f"{name}   {facts.frames} frames of {camera.width} x {camera.height} px"
     figure.suptitle(title, fontsize=13, parse_math=False)
     heights = [5.6, 3.4, 4.8, *([UNSURE_HEIGHT] if unsure else [])]
-    images, curves, space, *rest = figure.subfigures(len(heights), 1, height_ratios=heights)
+    images, curves, space, *rest = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
     _draw_frames(images, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
-    left, right = curves.subfigures(1, 2, width_ratios=[1, 2.4])
+    left, right = curves.subfigures(1, 2, squeeze=False, width_ratios=[1, 2.4]).flat
     _draw_histogram(left.subplots(), facts)
     _draw_curves(right, facts, findings)
     axes = space.subplots(1, 3, width_ratios=[1, 1.15, 1.45])
@@ -97,21 +87,11 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
             axis.set_axis_off()
     if high <= 0:
         return
-    bar = part.colorbar(
-        ScalarMappable(Normalize(low, max(high, 1.0001 * low)), "turbo"),
-        ax=axes.ravel().tolist(),
-        location="right",
-        fraction=0.02,
-        pad=0.01,
-        aspect=45,
-    )
+    scale = ScalarMappable(Normalize(low, max(high, 1.0001 * low)), "turbo")
+    place = {"location": "right", "fraction": 0.02, "pad": 0.01, "aspect": 45}
+    bar = part.colorbar(scale, ax=axes.ravel().tolist(), **place)
     bar.set_label(f"depth, {length_unit(facts.depth.relative)}", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-
-
-def least_certain(facts: Facts) -> list[int]:
-    """Frames whose masks are uncertain, the least certain first; at most `MOST_UNSURE`."""
-    return sorted(facts.masks.uncertain, key=lambda i: (facts.masks.confidence[i], i))[:MOST_UNSURE]
 
 
 def _draw_unsure(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
@@ -137,25 +117,23 @@ def _outlined(frame: Frame, border: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 def _draw_border(axis: Axes, facts: Facts) -> None:
     """Strips, round border and labels, in yellow; dotted where the masks already exclude them."""
-    border, (width, height) = facts.border, (facts.camera.width, facts.camera.height)
-    strips = border.strips
-    for size, at, extent in (
-        (strips.top, (0, 0), (width, strips.top)),
-        (strips.bottom, (0, height - strips.bottom), (width, strips.bottom)),
-        (strips.left, (0, 0), (strips.left, height)),
-        (strips.right, (width - strips.right, 0), (strips.right, height)),
-    ):
-        if size:
-            axis.add_patch(Rectangle(at, *extent, hatch="//", **_line(border.strips_as_tissue > SEEN_AS_TISSUE)))
-    if border.circle:
-        center = border.circle.center_x, border.circle.center_y
-        axis.add_patch(Circle(center, border.circle.radius, **_line(border.outside_as_tissue > SEEN_AS_TISSUE)))
-    for x, y, box_width, box_height in border.overlays:
-        axis.add_patch(Rectangle((x, y), box_width, box_height, **_line(True)))
-
-
-def _line(solid: bool) -> dict[str, object]:
-    return {"fill": False, "edgecolor": BORDER_COLOR, "linewidth": 1.2, "linestyle": "-" if solid else ":"}
+    border, strips, width, height = facts.border, facts.border.strips, facts.camera.width, facts.camera.height
+    sides = (
+        (0, 0, width, strips.top),
+        (0, height - strips.bottom, width, strips.bottom),
+        (0, 0, strips.left, height),
+        (width - strips.right, 0, strips.right, height),
+    )
+    open_strips, open_circle = (s > SEEN_AS_TISSUE for s in (border.strips_as_tissue, border.outside_as_tissue))
+    patches: list[tuple[Patch, bool]] = [
+        (Rectangle((x, y), across, down, hatch="//"), open_strips) for x, y, across, down in sides if across and down
+    ]
+    if circle := border.circle:
+        patches.append((Circle((circle.center_x, circle.center_y), circle.radius), open_circle))
+    patches += [(Rectangle((x, y), across, down), True) for x, y, across, down in border.overlays]
+    for patch, is_open in patches:
+        patch.set(fill=False, edgecolor=BORDER_COLOR, linewidth=1.2, linestyle="-" if is_open else ":")
+        axis.add_patch(patch)
 
 
 def _draw_ruler(axis: Axes, frame: Frame) -> None:

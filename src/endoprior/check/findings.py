@@ -24,47 +24,36 @@ from .facts import Facts
 
 Severity = Literal["error", "warning", "note"]
 
-TOOL_MOST = 0.6
-"""With a larger share of tool pixels there is too little tissue for training."""
-COVERED = 0.5
-"""Depth on a smaller share of the tissue is sparse."""
+TOOL_MOST = 0.6  # With a larger share of tool pixels there is too little tissue for training
+COVERED = 0.5  # Depth on a smaller share of the tissue is sparse
 FEW_FRAMES, FEWEST_FRAMES = 10, 2
 """Fewer than the first contain little motion and leave one test frame; training needs the second."""
-SEEN_AS_TISSUE = 0.5
-"""A border is reported if the masks mark a larger share of it as tissue."""
-VERTICAL_PX = 1.5
-"""Largest vertical offset of rectified cameras, px."""
-ODD_VIEW_DEG = (20.0, 120.0)
-"""Range of the horizontal field of view of endoscopes."""
+SEEN_AS_TISSUE = 0.5  # A border is reported if the masks mark a larger share of it as tissue
+VERTICAL_PX = 1.5  # Largest vertical offset of rectified cameras, px
+ODD_VIEW_DEG = (20.0, 120.0)  # Range of the horizontal field of view of endoscopes
 OFF_SCALE, SAME_SCALE = 0.2, 0.1
 """A principal point off by more than the first, and on both axes alike up to the second: another size."""
-USUAL_FOCAL = 0.9
-"""Focal length of a usual endoscope, image widths: 58 degrees."""
+USUAL_FOCAL = 0.9  # Focal length of a usual endoscope, image widths: 58 degrees
 ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
 """Seconds of a training iteration with `default` on two cores, start included, at this size of the image, and the share
 that does not depend on it (docs/results.md)."""
-DARK = 0.05
-"""Images with a smaller mean, of 1, are nearly black."""
+DARK = 0.05  # Images with a smaller mean, of 1, are nearly black
 FAR_SHARE = 1e-3
 """A larger share of the tissue beyond the reach of an endoscope is a filling of holes, or a wrong depth."""
-DEPTH_JUMP = 0.2
-"""Change of the log median depth between two frames that is too large for tissue motion."""
+DEPTH_JUMP = 0.2  # Change of the log median depth between two frames that is too large for tissue motion
 
 
 @dataclass(frozen=True)
 class Finding:
     """One problem of a sequence."""
 
-    code: str
-    """Stable name."""
+    code: str  # Stable name
     severity: Severity
     """`error`: training would fail or learn something wrong; `warning`: it costs quality; `note`: good to know."""
-    what: str
-    """The problem, on one line."""
+    what: str  # The problem, on one line
     fix: str
     """What to do: an edit, or a command or options of one in backticks. Numbers of frames are those of this check."""
-    frames: tuple[int, ...] = ()
-    """Affected frames; empty for all."""
+    frames: tuple[int, ...] = ()  # Affected frames; empty for all
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.code}: {self.what}. Fix: {self.fix}"
@@ -72,20 +61,7 @@ class Finding:
 
 def find(facts: Facts) -> list[Finding]:
     """All findings, errors first."""
-    checks = (
-        _masks,
-        _depth,
-        _unit,
-        _border,
-        _stereo,
-        _motion,
-        _poses,
-        _windows,
-        _changes,
-        _video,
-        _intrinsics,
-        _rest,
-    )
+    checks = (_masks, _depth, _unit, _border, _stereo, _motion, _poses, _windows, _changes, _video, _intrinsics, _rest)
     order = ("error", "warning", "note")
     return sorted((found for check in checks for found in check(facts)), key=lambda found: order.index(found.severity))
 

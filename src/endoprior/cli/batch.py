@@ -6,7 +6,7 @@ import os
 import re
 import shlex
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -16,30 +16,27 @@ from ..core.checks import InputError, input_error
 from ..data.load import is_sequence
 from ..data.reading import kind_of, read_text
 from ..system.console import say
-from .arguments import Help, option_name, parse
+from .arguments import Command, option_name
 from .devices import with_device
-from .progress import step_progress
-from .run import HELP as RUN_HELP
-from .run import Run, job_of, require_gaussians
-from .train import arguments
+from .paths import require_writable_folder
+from .progress import Counting, step_progress
+from .run import Run
+from .train import Train, require_gaussians
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
     from ..pipeline import Entry, Outcome, SequenceJob
-    from ..prepare.pipeline import Progress
 
 NAME = re.compile(r"[^\W_][\w .+-]*")
 """A name of a folder."""
-NOT_IN_A_LIST = (
-    "--help", "-h", "--help-all", "--networks", "--no-networks", "--weights-dir", "--resume", "--checkpoint-seconds",
-    "--ray", "--view", "--view-port",
-)  # fmt: skip
+NOT_IN_A_LIST = set(
+    "--help -h --help-all --networks --no-networks --weights-dir --resume --checkpoint-seconds --ray --view "
+    "--view-port".split()
+)
 """Options of a single training; a batch does as `endoprior run`."""
 
 
 @dataclass
-class Batch:
+class Batch(Command):
     """Many videos and sequence folders, one after the other or on a Ray cluster: each as `endoprior run` does one.
 
     LIST has a line for each: `[NAME =] PATH [OPTIONS]`, with options of `endoprior run` for a video and of `endoprior
@@ -54,50 +51,41 @@ class Batch:
     ray: str | None = None
     """Train on a Ray cluster that shares this file system: its address, `auto`, or `local`, which starts one."""
 
+    examples = ("LIST OUT", "LIST OUT --ray auto")
 
-HELP = Help(examples=(("LIST", "OUT"), ("LIST", "OUT", "--ray", "auto")))
+    def execute(self) -> int:
+        """Do every job of the list and write the table; 1 if one failed."""
+        from ..pipeline import SUMMARY, TABLE, run_here, run_on, write_summary
+        from ..runs import kernel_cache
+        from ..runs.folder import LOCK
+        from ..system.file_lock import locked
+        from ..system.ray_cluster import connected
 
-
-def run(argv: list[str]) -> int:
-    """Do every job of the list and write the table; 1 if one failed."""
-    args = parse(Batch, argv, "batch", HELP)
-    from ..pipeline import SUMMARY, TABLE, run_here, run_on, write_summary
-    from ..runs import kernel_cache
-    from ..runs.folder import LOCK
-    from ..system.file_lock import locked
-    from ..system.ray_cluster import connected
-    from .paths import require_writable_folder
-
-    entries = entries_of(args.list, args.out, cache(say))
-    require_writable_folder("OUT", args.out)
-    waiting = [entry for entry in entries if not entry.is_done]
-    say(f"{args.list}: {len(entries)} jobs, {len(entries) - len(waiting)} done before")
-    for entry in waiting:
-        kernel_cache.fill(entry.job.cfg, say)
-    outcomes = []
-    with connected(args.ray, say) if args.ray and waiting else nullcontext() as cluster:
-        try:
-            args.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise input_error(args.out, "a place for a folder", f"{error.strerror}", "choose another folder.") from None
-        with locked(args.out, args.out / LOCK):
-            try:
-                for outcome in run_on(cluster, entries, say) if cluster else run_here(entries, _shown):
-                    _tell(outcome)
-                    outcomes.append(outcome)
-            except KeyboardInterrupt:
-                say("Stopped. To resume, run the same command again.")
-                raise
-            outcomes.sort(key=lambda outcome: entries.index(outcome.entry))
-            lines = write_summary(outcomes, args.out)
-    say("")
-    for line in lines:
-        say(line)
-    say(f"\nThis table: {args.out / SUMMARY}; all scores: {args.out / TABLE}")
-    return 1 if any(outcome.failure for outcome in outcomes) else 0
+        entries = entries_of(self.list, self.out, cache(say))
+        require_writable_folder("OUT", self.out)
+        waiting = [entry for entry in entries if not entry.is_done]
+        say(f"{self.list}: {len(entries)} jobs, {len(entries) - len(waiting)} done before")
+        for entry in waiting:
+            kernel_cache.fill(entry.job.cfg, say)
+        outcomes = []
+        with connected(self.ray, say) if self.ray and waiting else nullcontext() as cluster:
+            self.out.mkdir(parents=True, exist_ok=True)
+            with locked(self.out, self.out / LOCK):
+                try:
+                    for outcome in run_on(cluster, entries, say) if cluster else run_here(entries, _shown):
+                        _tell(outcome)
+                        outcomes.append(outcome)
+                except KeyboardInterrupt:
+                    say("Stopped. To resume, run the same command again.")
+                    raise
+                outcomes.sort(key=lambda outcome: entries.index(outcome.entry))
+                lines = write_summary(outcomes, self.out)
+        for line in ("", *lines, f"\nThis table: {self.out / SUMMARY}; all scores: {self.out / TABLE}"):
+            say(line)
+        return 1 if any(outcome.failure for outcome in outcomes) else 0
 
 
-def _shown(entry: Entry, step: str) -> AbstractContextManager[Progress]:
+def _shown(entry: Entry, step: str) -> AbstractContextManager[Counting]:
     """The progress of a step of a job in this process."""
     from ..pipeline import steps_of
 
@@ -119,57 +107,30 @@ def _tell(outcome: Outcome) -> None:
             say(f"     {line}")
 
 
-@dataclass(frozen=True)
-class Line:
-    """A line of a list: `[NAME =] PATH [OPTIONS]`."""
-
-    number: int
-    name: str
-    path: Path
-    options: tuple[str, ...]
-
-
-def read_list(file: Path) -> list[Line]:
-    """The jobs in a list; empty lines and what follows a `#` are skipped.
-
-    Raises:
-        InputError: the file cannot be read, has no job, or two with one name.
-    """
-    fix = "write a line `PATH [OPTIONS]` for each video or sequence folder."
-    text, lines = read_text(file, "a list of videos and sequence folders", fix), list[Line]()
-    for number, written in enumerate(text.splitlines(), 1):
-        try:
-            words = _words(written)
-        except ValueError as error:
-            raise input_error(f"{file}, line {number}", "words as in a shell", f"{error}", "correct it.") from None
-        if words:
-            lines.append(_line(file, number, words))
-    if not lines:
-        raise input_error(file, "a list of videos and sequence folders", "an empty file", fix)
-    first = {line.name: line for line in reversed(lines)}
-    for line in lines:
-        if (other := first[line.name]) is not line:
-            got = f"{line.name!r} in line {other.number}, too"
-            raise input_error(f"{file}, line {line.number}", "another name", got, f"`NAME = {line.path}`.")
-    return lines
-
-
 def entries_of(file: Path, out: Path, tell: Callable[[str], None]) -> list[Entry]:
-    """The jobs in a list, with results in folders of `out`. Nothing is written.
+    """The jobs in a list, with results in folders of `out`; empty lines and what follows a `#` are skipped.
 
     Args:
         tell: takes the device that trains, and the reason.
-    Raises:
-        InputError: the list, or what a line of it names, cannot be used.
     """
     from ..pipeline import Entry
 
-    entries = []
-    for line in read_list(file):
+    fix = "write a line `PATH [OPTIONS]` for each video or sequence folder."
+    text, entries, lines = read_text(file, "a list of videos and sequence folders", fix), [], dict[str, int]()
+    for number, written in enumerate(text.splitlines(), 1):
         try:
-            entries.append(Entry(line.name, _job(line, out / line.name, tell)))
-        except InputError as error:
-            raise InputError(f"{file}, line {line.number}: {error}") from None
+            if not (words := _words(written)):
+                continue
+            name, path, options = _parts(words)
+            if other := lines.setdefault(name, number) - number:
+                got = f"{name!r} in line {number + other}, too"
+                raise input_error("NAME", "another one", got, f"`NAME = {path}`.")
+            entries.append(Entry(name, _job(path, out / name, options, tell)))
+        except ValueError as error:
+            problem = f"{error}" if isinstance(error, InputError) else f"expected words as in a shell, got {error}"
+            raise InputError(f"{file}, line {number}: {problem}") from None
+    if not entries:
+        raise input_error(file, "a list of videos and sequence folders", "an empty file", fix)
     return entries
 
 
@@ -180,29 +141,30 @@ def _words(line: str) -> list[str]:
     return [word.strip('"') for word in shlex.split(line, comments=True, posix=False)]
 
 
-def _line(file: Path, number: int, words: list[str]) -> Line:
+def _parts(words: list[str]) -> tuple[str, Path, list[str]]:
+    """Name, path and options of a line `[NAME =] PATH [OPTIONS]`."""
     name, rest = (words[0], words[2:]) if words[1:2] == ["="] else (None, words)
-    where, fix = f"{file}, line {number}", "write `PATH [OPTIONS]` or `NAME = PATH [OPTIONS]`."
     if not rest or rest[0].startswith("-"):
-        raise input_error(where, "a path", rest[0] if rest else "none", fix)
+        fix = "write `PATH [OPTIONS]` or `NAME = PATH [OPTIONS]`."
+        raise input_error("PATH", "a video or a folder", rest[0] if rest else "none", fix)
     path = Path(rest[0]).expanduser()
     name = name or (path.name if kind_of(path) == "a folder" else path.stem)
     if not NAME.fullmatch(name):
-        raise input_error(where, "a name for a folder: letters, digits, and spaces, dots or dashes", repr(name), fix)
-    return Line(number, name, path, tuple(rest[1:]))
+        want = "a name for a folder: letters, digits, and spaces, dots or dashes"
+        raise input_error("NAME", want, repr(name), "write `NAME = PATH [OPTIONS]`.")
+    return name, path, rest[1:]
 
 
-def _job(line: Line, out: Path, tell: Callable[[str], None]) -> SequenceJob:
-    if kind_of(line.path) == "nothing":
-        raise input_error(line.path, "a video or a sequence folder", "nothing", "correct the path.")
-    for word in line.options:
-        if option_name(word) in NOT_IN_A_LIST:
-            raise input_error(word, "options of what to train", "one of a single training", "remove it.")
-    argv = [str(line.path), str(out), *line.options]
-    if not is_sequence(line.path):
-        return job_of(parse(Run, argv, "run", RUN_HELP), tell)
+def _job(path: Path, out: Path, options: list[str], tell: Callable[[str], None]) -> SequenceJob:
+    if kind_of(path) == "nothing":
+        raise input_error(path, "a video or a sequence folder", "nothing", "correct the path.")
+    if single := [word for word in options if option_name(word) in NOT_IN_A_LIST]:
+        raise input_error(single[0], "options of what to train", "one of a single training", "remove it.")
+    argv = [str(path), str(out), *options]
+    if not is_sequence(path):
+        return Run.from_words(argv).job(tell)
     from ..pipeline import SequenceJob
 
-    args = arguments(argv)
-    require_gaussians(args.config, "`train`, `eval` and `render` one after the other.")
-    return SequenceJob(line.path, out, with_device(args.config, args.device, tell))
+    train = Train.from_words(argv)
+    require_gaussians(train.config, "`train`, `eval` and `render` one after the other.")
+    return SequenceJob(path, out, with_device(train.config, train.device, tell))

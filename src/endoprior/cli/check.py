@@ -1,19 +1,19 @@
-"""`endoprior check DATA`."""
+"""`endoprior check DATA` and `endoprior prior DATA OUT`: look at a sequence before training."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
-from ..core.shell import quoted
 from ..system.console import say
-from .arguments import Help, parse
+from .arguments import Command
 
 
 @dataclass
-class Check:
+class Check(Command):
     """Check a sequence before training: print its properties and problems, and draw a figure."""
 
     folder: Path = field(metadata={"place": "DATA"})
@@ -26,46 +26,59 @@ class Check:
     """Exit with status 2 if there is a problem of severity `error`."""
     data: DataConfig = field(default_factory=DataConfig)
 
+    examples = ("DATA", "DATA --out DATA.png --strict")
+    basics = "--out --json --strict --data.first-frames --data.stride --data.shrink --data.format"
 
-HELP = Help(
-    examples=(("DATA",), ("DATA", "--out", "DATA.png", "--strict")),
-    basics={
-        "results": ("--out", "--json", "--strict"),
-        "which frames": ("--data.first-frames", "--data.stride", "--data.shrink", "--data.format"),
-    },
-)
+    def execute(self) -> None:
+        """Measure the sequence, print the report, write the figure."""
+        if self.out.suffix.lower() != ".png":
+            raise input_error("--out", "a .png file", str(self.out), "end the name in .png.")
+        from .paths import require_writable_file
+
+        for option, file in (("--out", self.out), ("--json", self.json)):
+            if file is not None:
+                require_writable_file(option, file, self.folder)
+        from ..check import draw_check, find, measure
+        from ..check.report import as_json, table
+        from ..data import load_sequence
+        from ..system.atomic import write_json
+
+        sequence = load_sequence(self.folder, self.data)
+        facts = measure(sequence, self.data)
+        findings = find(facts)
+        say(f"{self.folder}")
+        for name, value in table(facts):
+            say(f"  {name:<18}{value}")
+        for finding in findings or ["no problems found"]:
+            say(str(finding))
+        if self.json:
+            write_json(self.json, as_json(facts, findings))
+        draw_check(sequence, facts, findings, self.out)
+        say(f"figure: {self.out}")
+        errors = [finding for finding in findings if finding.severity == "error"]
+        if self.strict and errors:
+            raise InputError(f"{self.folder}: expected no errors with --strict, got {len(errors)}: {errors[0]}")
 
 
-def run(argv: list[str]) -> None:
-    """Measure the sequence, print the report, write the figure."""
-    args = parse(Check, argv, "check", HELP)
-    if args.out.suffix.lower() != ".png":
-        fix = f"`--out {quoted(args.out.with_suffix('.png'))}`."
-        raise input_error("--out", "a .png file", str(args.out), fix)
-    from .paths import require_writable_file
+@dataclass
+class Prior(Command):
+    """Write the cue maps and the joint texture prior of each frame: one PNG per map, and a contact sheet."""
 
-    for option, file in (("--out", args.out), ("--json", args.json)):
-        if file is not None:
-            require_writable_file(option, file, args.folder)
-    from ..check import draw_check, find, measure
-    from ..check.report import as_json, table
-    from ..data import load_sequence
-    from ..system.atomic import write_json
+    data: Path = field(metadata={"place": "DATA"})
+    """Sequence folder."""
+    out: Path = field(metadata={"place": "OUT"})
+    """Folder for specular/, salience/, prior/ and contact_sheet.png."""
+    split: Literal["train", "test", "video"] = "video"
+    """Frames to write."""
 
-    sequence = load_sequence(args.folder, args.data)
-    facts = measure(sequence, args.data)
-    findings = find(facts)
-    say(f"{args.folder}")
-    for name, value in table(facts):
-        say(f"  {name:<18}{value}")
-    for finding in findings:
-        say(str(finding))
-    if not findings:
-        say("no problems found")
-    if args.json:
-        write_json(args.json, as_json(facts, findings))
-    draw_check(sequence, facts, findings, args.out)
-    say(f"figure: {args.out}")
-    errors = [finding for finding in findings if finding.severity == "error"]
-    if args.strict and errors:
-        raise InputError(f"{args.folder}: expected no errors with --strict, got {len(errors)}: {errors[0]}")
+    examples = ("DATA OUT", "DATA OUT --split test")
+    basics = "--split"
+
+    def execute(self) -> None:
+        """Write the maps."""
+        from ..data import load_sequence
+        from ..visualization.prior_maps import write_prior_maps
+
+        sequence = load_sequence(self.data)
+        sheet = write_prior_maps(sequence, self.split, self.out)
+        say(f"{len(sequence.indices(self.split))} frames: {self.out}\ncontact sheet: {sheet}")

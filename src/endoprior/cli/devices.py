@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
@@ -62,21 +63,17 @@ def why_no_gpu() -> str:
 
 @cache
 def try_backend(backend: Backend, *, compiles: bool = False) -> Trial:
-    """Render with a backend in a process of its own: it may crash, hang or print anything.
-
-    Args:
-        compiles: let gsplat compile itself first, which takes minutes.
-    """
+    """Render with a backend in a process of its own: it may crash, hang, print anything, and compile gsplat first."""
     limit_s = COMPILE_LIMIT_S if compiles else TRIAL_LIMIT_S
     words = python_command("endoprior.render.trial", backend, *["compile"] * compiles)
+    status = None
     with tempfile.TemporaryFile() as output:  # no pipe: what the process starts could keep one open
         process = subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
         )
         try:
-            status = process.wait(limit_s)
-        except subprocess.TimeoutExpired:
-            status = None
+            with suppress(subprocess.TimeoutExpired):
+                status = process.wait(limit_s)
         finally:  # also after Ctrl-C
             _end(process)
         output.seek(0)
@@ -89,25 +86,20 @@ def try_backend(backend: Backend, *, compiles: bool = False) -> Trial:
 
 def _end(process: subprocess.Popen) -> None:
     """End the process and, where that is possible, all that it started; a driver that hangs may keep it."""
-    try:
+    with suppress(OSError):  # all gone
         if os.name == "posix":
             os.killpg(process.pid, signal.SIGKILL)
         else:
             process.kill()
-    except OSError:  # all gone
-        pass
-    try:
+    with suppress(subprocess.TimeoutExpired):
         process.wait(1.0)
-    except subprocess.TimeoutExpired:
-        pass
 
 
 @cache
 def choose(wanted: Wanted) -> Choice:
     """The device and the backend: gsplat where it works and is compiled, else Triton where that works, else the CPU.
 
-    Raises:
-        InputError: "cuda" is wanted and no backend works on it.
+    InputError if "cuda" is wanted and no backend works on it.
     """
     if wanted == "cpu":
         return Choice("cpu", "numba", "CPU: as requested")
@@ -122,9 +114,8 @@ def choose(wanted: Wanted) -> Choice:
             failed.append(f"{backend}: {trial.found}")
         problem = "; ".join(failed)
     if wanted == "cuda":
-        raise input_error(
-            "--device cuda", "a GPU that renders", problem, "`endoprior doctor` and docs/gpu.md tell more."
-        )
+        fix = "`endoprior doctor` and docs/gpu.md tell more."
+        raise input_error("--device cuda", "a GPU that renders", problem, fix)
     return Choice("cpu", "numba", f"CPU: {problem}")
 
 
@@ -133,8 +124,6 @@ def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False
 
     Args:
         fp16_planes: on a GPU, store a HexPlane as fp16 (`Scene.to`): for viewing, not for scores.
-    Raises:
-        InputError: CUDA was requested and is not usable.
     """
     choice = choose(wanted)
     if wanted != "cpu":
@@ -144,23 +133,16 @@ def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False
 
 
 def with_device(cfg: Config, wanted: Wanted, tell: Callable[[str], None] = say) -> Config:
-    """The config with the rendering backend of the chosen device.
-
-    Args:
-        tell: takes the device and the reason, as a line for the user.
-    Raises:
-        InputError: CUDA was requested and is not usable, or the config names a GPU backend and the user the CPU.
-    """
+    """The config with the rendering backend of the chosen device; `tell` takes the device and the reason."""
     from ..render import ON_GPU
 
-    named = cfg.render.backend if cfg.render.backend in ON_GPU else None
-    if named:
-        option = f"--render.backend {named}"
+    if cfg.render.backend in ON_GPU:
+        option = f"--render.backend {cfg.render.backend}"
         if wanted == "cpu":
             raise input_error(option, "--device cuda or auto", "cpu", f"Remove --device cpu or {option}.")
         if problem := why_no_gpu():
             raise input_error(option, "a GPU that torch can use", problem, "leave it out for the CPU.")
-        tell(f"CUDA: {named}, as requested")  # which may compile itself first
+        tell(f"CUDA: {cfg.render.backend}, as requested")  # which may compile itself first
         return cfg
     choice = choose(wanted)
     tell(choice.why)

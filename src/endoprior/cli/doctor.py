@@ -1,4 +1,4 @@
-"""`endoprior doctor`."""
+"""`endoprior doctor` and `endoprior plugins`: what is installed, and what of it works."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
+from ..core.checks import InputError
+from ..core.config import Backend
 from ..core.shell import install_command, packages_of
 from ..system.console import say
 from ..system.installation import docs_folder, page, source_commit
 from ..system.memory import available_bytes
-from .arguments import Help, parse
+from ..system.plugins import OWN_PACKAGE, installed
+from .arguments import Command
 from .devices import choose, try_backend, why_no_gpu
 
 NEEDED = ("torch", "numba", "numpy")
@@ -27,62 +30,52 @@ OPTIONAL = {
 
 
 @dataclass
-class Doctor:
+class Doctor(Command):
     """Report versions and optional parts, and render a small scene with each backend that could work here."""
 
     compile: bool = False
     """Compile gsplat now, which takes minutes, and render with it. Without a GPU, as in a container build, it compiles
     for the architectures in TORCH_CUDA_ARCH_LIST. Exit status 1 if that fails."""
 
+    examples = ("", "--compile")
 
-HELP = Help(examples=((), ("--compile",)))
-
-
-def run(argv: list[str]) -> int:
-    """Print the report. Exit status 1 if the CPU cannot render or --compile fails, whatever else is missing."""
-    args = parse(Doctor, argv, "doctor", HELP)
-    say(f"endoprior {version('endoprior')}, commit {source_commit() or 'unknown'}; documentation: {docs_folder()}\n")
-    for name, found in (*machine().items(), *optional_parts().items()):
-        say(f"{name:<10}{found}")
-    say("")
-    works = {"numba": _tell("numba")}
-    if args.compile:
-        say("compiling gsplat; this takes minutes")
-        works["gsplat"] = _tell("gsplat", compiles=True)
-    if problem := why_no_gpu():
-        say(f"GPU       {problem}; everything runs on the CPU")
-    else:
-        for backend in ("triton", "gsplat"):
-            if backend not in works:
-                _tell(backend)
-    say(f"\n--device auto: {choose('auto').why}")
-    if not works["numba"]:
-        say(f"This computer cannot train yet: {page('install.md')}")
-    elif not works.get("gsplat", True) or choose("auto").device == "cpu":
-        say(f"What a GPU needs: {page('gpu.md')}")
-    return 0 if all(works.values()) else 1
-
-
-def machine() -> dict[str, str]:
-    """The computer and what every installation needs."""
-    free = available_bytes()
-    memory = "unknown memory" if free is None else f"{free / 1e9:.1f} GB free"
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "computer": f"{platform.platform(terse=True)}, {platform.machine()}, {cores} cores, {memory}",
-        "Python": platform.python_version(),
-        **{name: _version(name) or "not installed" for name in NEEDED},
-    }
+    def execute(self) -> int:
+        """Print the report. Exit status 1 if the CPU cannot render or --compile fails, whatever else is missing."""
+        say(
+            f"endoprior {version('endoprior')}, commit {source_commit() or 'unknown'}; documentation: {docs_folder()}\n"
+        )
+        free = available_bytes()
+        memory = "unknown memory" if free is None else f"{free / 1e9:.1f} GB free"
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        _row("computer", f"{platform.platform(terse=True)}, {platform.machine()}, {cores} cores, {memory}")
+        _row("Python", platform.python_version())
+        for name in NEEDED:
+            _row(name, _version(name) or "not installed")
+        for part, purpose in OPTIONAL.items():
+            versions = {name: _version(name) for name in packages_of(part)}
+            there = ", ".join(f"{name} {found}" for name, found in versions.items())
+            _row(part, f"{purpose}: {there if all(versions.values()) else install_command(part)}")
+        say("")
+        works = {"numba": _try("numba")}
+        if self.compile:
+            say("compiling gsplat; this takes minutes")
+            works["gsplat"] = _try("gsplat", compiles=True)
+        if problem := why_no_gpu():
+            _row("GPU", f"{problem}; everything runs on the CPU")
+        else:
+            for backend in ("triton", "gsplat"):
+                if backend not in works:
+                    _try(backend)
+        say(f"\n--device auto: {choose('auto').why}")
+        if not works["numba"]:
+            say(f"This computer cannot train yet: {page('install.md')}")
+        elif not works.get("gsplat", True) or choose("auto").device == "cpu":
+            say(f"What a GPU needs: {page('gpu.md')}")
+        return 0 if all(works.values()) else 1
 
 
-def optional_parts() -> dict[str, str]:
-    """What each optional part is for, and its versions or how to install it."""
-    parts = {}
-    for part, purpose in OPTIONAL.items():
-        versions = {name: _version(name) for name in packages_of(part)}
-        there = ", ".join(f"{name} {found}" for name, found in versions.items())
-        parts[part] = f"{purpose}: {there if all(versions.values()) else install_command(part)}"
-    return parts
+def _row(name: str, found: str) -> None:
+    say(f"{name:<10}{found}")
 
 
 def _version(package: str) -> str:
@@ -92,11 +85,44 @@ def _version(package: str) -> str:
         return ""
 
 
-def _tell(backend: str, *, compiles: bool = False) -> bool:
+def _try(backend: Backend, *, compiles: bool = False) -> bool:
     """Try a backend and print what came of it; whether it works."""
     trial = try_backend(backend, compiles=compiles)
-    say(f"{backend:<10}{'works' if trial.works else 'fails'}: {trial.found}")
+    _row(backend, f"{'works' if trial.works else 'fails'}: {trial.found}")
     if not trial.works:
         for line in trial.printed.splitlines()[-12:-1]:
-            say(f"{'':<10}| {line}")
+            _row("", f"| {line}")
     return trial.works
+
+
+@dataclass
+class Plugins(Command):
+    """List datasets, methods, scores, ...: what is built in, and what other packages add (docs/plugins.md)."""
+
+    examples = ("",)
+
+    def execute(self) -> None:
+        """Import every plugin and print one line for each."""
+        from ..data.formats import REGISTRY as DATASETS
+        from ..evaluation.protocols.table import PROTOCOLS
+        from ..evaluation.registry import REGISTRY as SCORES
+        from ..export.formats import REGISTRY as EXPORTERS
+        from ..model.method import METHODS
+        from ..model.presets import PRESETS
+        from . import REGISTRY as COMMANDS
+
+        _say_row("kind", "name", "package")
+        for registry in (DATASETS, METHODS, PRESETS, SCORES, PROTOCOLS, EXPORTERS, COMMANDS):
+            for name in registry.builtin:
+                _say_row(registry.kind, name, "built in")
+            for plugin in installed(registry.kind):
+                if plugin.package != OWN_PACKAGE:
+                    try:
+                        registry.loaded(plugin)
+                        _say_row(registry.kind, plugin.name, plugin.origin)
+                    except InputError as error:
+                        _say_row(registry.kind, plugin.name, plugin.origin, f"error: {error}")
+
+
+def _say_row(kind: str, name: str, package: str, error: str = "") -> None:
+    say(f"{kind:<11}{name:<20}{package:<28}{error}".rstrip())

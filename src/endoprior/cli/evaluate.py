@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..core.checks import input_error
-from ..core.shell import command
+from ..data import FrameSequence, load_sequence
+from ..evaluation.protocols.table import KEYS, SCORES, chosen_protocols
+from ..evaluation.registry import all_scores
+from ..evaluation.score import GROUPS, Score
 from ..system.console import say
 from ..system.installation import page
-from .arguments import Help, parse
+from .arguments import Command
 from .devices import Wanted, on_device
-from .paths import folder_of, open_scene
-from .score_table import score_table
+from .paths import folder_of, open_scene, require_writable_folder
 
 if TYPE_CHECKING:
-    from ..data import FrameSequence
     from ..evaluation.context import Evaluation
     from ..model.scene import RenderedScene
-
 
 BETTER = "\u2191 higher is better, \u2193 lower is better"
 MOST_MM_PER_UNIT = 1e6
 """Largest --depth-scale."""
+COLUMNS = 3
+"""Protocols beside ours in one block, so that lines stay near 100 characters."""
+NAME, WIDTH = 18, 21
 
 
 @dataclass
-class Eval:
+class Eval(Command):
     """Score a trained scene, another program's images, or tool masks; writes metrics.json and per_frame.json.
 
     Splits other than test have files of their own: metrics_train.json, per_frame_train.json.
@@ -61,139 +64,175 @@ class Eval:
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
+    examples = ("RUN", "RUN --split train", "--pictures FOLDER DATA", "--masks TRUTH DATA")
 
-HELP = Help(
-    examples=(("RUN",), ("RUN", "--split", "train"), ("--pictures", "FOLDER", "DATA"), ("--masks", "TRUTH", "DATA"))
-)
+    def execute(self) -> None:
+        """Score and print."""
+        if self.masks:
+            self._score_masks(self.masks)
+            return
+        reject_missing_weights(self.weights_dir)
+        self._how()  # reject an unknown protocol now
+        if self.pictures:
+            self._score_pictures(self.pictures)
+            return
+        self._reject(["depth_pictures", "depth_scale", "name"], "--pictures beside it", "a run")
+        scene = open_scene(self.run)
+        run = folder_of(self.run)
+        require_writable_folder("--out" if self.out else "RUN", self.out or run)
+        self.score_run(on_device(scene, self.device), run)
+
+    def score_run(self, scene: RenderedScene, run: Path, extra: Mapping[str, float] | None = None) -> None:
+        """Score the `scene` of a run folder, write the two files with these `extra` scores, print a table."""
+        from ..evaluation.scoring import evaluate, scored_data
+        from ..runs.folder import sequence_of_run
+        from ..runs.log import growth_of, mask_facts
+
+        # Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
+        sequence = load_sequence(self.data or sequence_of_run(run), scored_data(scene.config.data))
+        result = evaluate(scene, sequence, self.split, **self._how())
+        growth = growth_of(run)
+        result.scores |= dict(extra or {}) | ({"gaussians_growth": growth.ratio} if growth else {})
+        result.protocol |= mask_facts(run)
+        self._finish(result, sequence, self.out or run, ". To see them: `endoprior render RUN` with the same --split")
+
+    def _score_pictures(self, folder: Path) -> None:
+        """Score the rendered frames in `folder` on the sequence that takes the place of the run."""
+        from ..evaluation.pictures import Pictures
+        from ..evaluation.scoring import evaluate
+
+        self._reject(["data"], "--pictures FOLDER DATA", "--data as well")
+        if self.depth_scale is not None and not 0 < self.depth_scale <= MOST_MM_PER_UNIT:
+            want = f"a number above 0, up to {MOST_MM_PER_UNIT:g}"
+            raise input_error("--depth-scale", want, f"{self.depth_scale}", "Correct it.")
+        out = self.out or folder
+        require_writable_folder("--out" if self.out else "--pictures", out)
+        sequence = load_sequence(self.run)
+        depth = {"depth_folder": self.depth_pictures, "depth_scale": self.depth_scale}
+        pictures = Pictures(folder, sequence, self.split, name=self.name, **depth)
+        for line in pictures.remarks:
+            say(line)
+        result = evaluate(pictures, sequence, self.split, **self._how())
+        self._finish(result, sequence, out)
+
+    def _score_masks(self, folder: Path) -> None:
+        """Score the masks of the sequence that takes the place of the run against the true masks in `folder`."""
+        from ..evaluation.true_masks import TrueMasks, score_masks
+
+        others = [each.name for each in fields(self) if each.name not in ("run", "out", "masks")]
+        self._reject(others, "--masks TRUTH DATA, with no option but --out", "it beside them")
+        if self.out:
+            require_writable_folder("--out", self.out)
+        sequence = load_sequence(self.run)
+        truth = TrueMasks(folder, sequence)
+        count = len(truth.indices)
+        say(f"{truth.folder}: true masks of {count} of {len(sequence)} frames, {truth.matched_by}")
+        say(f"true masks: {truth.polarity}")
+        result = score_masks(sequence, truth)
+        say(f"\nscores of the tool masks in {count} frames ({BETTER})")
+        for line in score_table(result.scores, result.skipped):
+            say(line)
+        if left_out := result.protocol["share_of_pixels_left_out"]:
+            say(f"note: {left_out:.1%} of the pixels do not count: border around the image, or burned-in labels")
+        saved = f"all scores: {result.save(self.out)}" if self.out else "to keep the scores: --out FOLDER"
+        say(f"{saved}; what they mean: {page('scores.md')}")
+
+    def _finish(self, result: Evaluation, sequence: FrameSequence, out: Path, to_see: str = "") -> None:
+        """Write the two files into `out`, and print a table; name frames to look at, and how `to_see` them."""
+        file = result.save(out)
+        held_out = f"; {sequence.split_rule}" if sequence.test_phase else ""
+        say(f"\nscores of the {len(sequence.indices(self.split))} {self.split} frames ({BETTER}{held_out})")
+        relative = sequence.depth_is_relative
+        for line in (*score_table(result.scores, result.skipped, relative), *protocol_table(result, relative)):
+            say(line)
+        if outliers := result.outlier_frames():
+            frames = ", ".join(map(str, outliers))
+            say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median{to_see}")
+        say(f"all scores: {file}; what they mean: {page('scores.md')}")
+
+    def _how(self) -> dict[str, Any]:
+        """Options of `scoring.evaluate`."""
+        protocols = chosen_protocols(self.protocol) if self.protocol else ()
+        return {"networks": self.networks, "weights_dir": self.weights_dir, "protocols": protocols}
+
+    def _reject(self, names: Sequence[str], expected: str, got: str) -> None:
+        """Reject options that would have no effect."""
+        for each in fields(self):
+            if each.name in names and getattr(self, each.name) != each.default:
+                option = f"--{'no-' if each.default is True else ''}{each.name.replace('_', '-')}"
+                raise input_error(option, expected, got, f"Remove {option}.")
 
 
-def run(argv: list[str]) -> None:
-    """Score and print."""
-    args = parse(Eval, argv, "eval", HELP)
-    from ..evaluation.protocols.table import chosen_protocols
-    from ..runs.folder import sequence_of_run
-    from .paths import require_writable_folder
-
-    if args.masks:
-        evaluate_masks(args, args.masks)
-        return
-    if args.weights_dir and not args.weights_dir.is_dir():
-        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
-    protocols = chosen_protocols(args.protocol) if args.protocol else ()
-    if args.pictures:
-        evaluate_pictures(args, args.pictures, protocols)
-        return
-    if given := [o for o in ("depth_pictures", "depth_scale", "name") if getattr(args, o) not in (None, "")]:
-        option = f"--{given[0].replace('_', '-')}"
-        raise input_error(option, "--pictures beside it", "a run", f"Remove {option}, or add --pictures FOLDER.")
-    scene = open_scene(args.run)
-    run = folder_of(args.run)
-    out = args.out or run
-    require_writable_folder("--out" if args.out else "RUN", out)
-    data = args.data or sequence_of_run(run)
-    scene = on_device(scene, args.device)
-    evaluate_run(scene, run, data, out, args.split, args.networks, args.weights_dir, extra={}, protocols=protocols)
+def reject_missing_weights(folder: Path | None) -> None:
+    """Reject a --weights-dir that is no folder."""
+    if folder and not folder.is_dir():
+        raise input_error(folder, "a folder with weights", "none", "Correct --weights-dir.")
 
 
-def evaluate_run(
-    scene: RenderedScene,
-    run: Path,
-    data: Path,
-    out: Path,
-    split: Literal["test", "train", "video"],
-    networks: bool,
-    weights_dir: Path | None,
-    extra: dict[str, float],
-    protocols: Sequence[str] = (),
-) -> None:
-    """Score the `scene` of a `run` on the sequence folder `data`, write the two files into `out`, print a table.
+def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relative: bool = False) -> list[str]:
+    """The lines of the table, at most 29 and as many as there are reasons for skipped scores.
 
-    Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
+    Args:
+        skipped: reason by name, of scores that could not be computed.
+        relative: whether the scale of the depth is unknown, so that lengths are not in mm.
     """
-    from ..data import load_sequence
-    from ..evaluation.scoring import evaluate, scored_data
-    from ..runs.log import growth_of, mask_facts
-
-    sequence = load_sequence(data, scored_data(scene.config.data))
-    result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir, protocols=protocols)
-    growth = growth_of(run)
-    result.scores |= extra | ({"gaussians_growth": growth.ratio} if growth else {})
-    result.protocol |= mask_facts(run)
-    save_and_print(result, sequence, out, split, run)
-
-
-def evaluate_pictures(args: Eval, folder: Path, protocols: Sequence[str]) -> None:
-    """Score the rendered frames in `folder` on the sequence that takes the place of the run."""
-    from ..data import load_sequence
-    from ..evaluation.pictures import Pictures
-    from ..evaluation.scoring import evaluate
-    from .paths import require_writable_folder
-
-    if args.data:
-        raise input_error("--data", "--pictures FOLDER DATA", "--data as well", "Remove --data.")
-    if args.depth_scale is not None and not 0 < args.depth_scale <= MOST_MM_PER_UNIT:
-        want = f"a number above 0, up to {MOST_MM_PER_UNIT:g}"
-        raise input_error("--depth-scale", want, f"{args.depth_scale}", "Correct it.")
-    out = args.out or folder
-    require_writable_folder("--out" if args.out else "--pictures", out)
-    sequence = load_sequence(args.run)
-    depth = {"depth_folder": args.depth_pictures, "depth_scale": args.depth_scale}
-    pictures = Pictures(folder, sequence, args.split, name=args.name, **depth)
-    for line in pictures.remarks:
-        say(line)
-    networks = {"networks": args.networks, "weights_dir": args.weights_dir}
-    result = evaluate(pictures, sequence, args.split, **networks, protocols=protocols)
-    save_and_print(result, sequence, out, args.split)
+    lines = []
+    for group in GROUPS:
+        title = group
+        for score in _summary(scores):
+            if score.group == group:
+                value, hint = score.text(scores[score.name], relative), _references(score, scores) or score.hint
+                lines.append(f"  {title:<7} {score.label:<18} {value:>15} {score.arrow:1}  {hint}".rstrip())
+                title = ""
+    if relative and any(score.is_length for score in _summary(scores)):
+        lines.append("  rel.: the scale of the depth is unknown. Compare these scores on this sequence only.")
+    labels: dict[str, list[str]] = {}  # scores that need the same missing package stand together
+    for score in _summary(skipped):
+        labels.setdefault(skipped[score.name], []).append(score.label)
+    return lines + [f"  not computed: {', '.join(names)}: {reason}" for reason, names in labels.items()]
 
 
-def evaluate_masks(args: Eval, folder: Path) -> None:
-    """Score the masks of the sequence that takes the place of the run against the true masks in `folder`."""
-    from ..data import load_sequence
-    from ..evaluation.true_masks import TrueMasks, score_masks
-    from .paths import require_writable_folder
-
-    plain = Eval(args.run, out=args.out, masks=folder)
-    if other := next((f.name for f in fields(Eval) if getattr(args, f.name) != getattr(plain, f.name)), None):
-        option = f"--{'no-' if other == 'networks' else ''}{other.replace('_', '-')}"
-        raise input_error(
-            option, "--masks TRUTH DATA, with no option but --out", f"{option} as well", f"Remove {option}."
-        )
-    if args.out:
-        require_writable_folder("--out", args.out)
-    sequence = load_sequence(args.run)
-    truth = TrueMasks(folder, sequence)
-    total = len(sequence)
-    say(f"{truth.folder}: true masks of {len(truth.indices)} of {total} frames, {truth.matched_by}")
-    say(f"true masks: {truth.polarity}")
-    result = score_masks(sequence, truth)
-    say(f"\nscores of the tool masks in {len(truth.indices)} frames ({BETTER})")
-    for line in score_table(result.scores, result.skipped):
-        say(line)
-    if left_out := result.protocol["share_of_pixels_left_out"]:
-        say(f"note: {left_out:.1%} of the pixels do not count: border around the image, or burned-in labels")
-    saved = f"all scores: {result.save(args.out)}" if args.out else "to keep the scores: --out FOLDER"
-    say(f"{saved}; what they mean: {page('scores.md')}")
+def _summary(names: Mapping[str, object]) -> list[Score]:
+    return [score for name, score in all_scores().items() if name in names and score.in_summary]
 
 
-def save_and_print(
-    result: Evaluation,
-    sequence: FrameSequence,
-    out: Path,
-    split: Literal["test", "train", "video"],
-    run: Path | None = None,
-) -> None:
-    """Write the two files into `out`, and print a table; name frames to look at in the `run`, if there is one."""
-    from .score_table import protocol_table
+def _references(score: Score, scores: Mapping[str, float]) -> str:
+    """What chained optical flow and no motion score, for scores of tracks; what a warp does, for the right eye."""
+    if (warp := scores.get(f"{score.name}_warp")) is not None:
+        return f"left eye moved by depth {warp:,.{score.digits}f}"
+    if f"{score.name}_still" not in scores:
+        return ""
+    known = {what: scores.get(f"{score.name}_{end}") for end, what in (("dis", "chained flow"), ("still", "no motion"))}
+    return ", ".join(f"{what} {value:,.{score.digits}f}" for what, value in known.items() if value is not None)
 
-    file = result.save(out)
-    held_out = f"; {sequence.split_rule}" if sequence.test_phase else ""
-    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({BETTER}{held_out})")
-    for line in score_table(result.scores, result.skipped, sequence.depth_is_relative):
-        say(line)
-    for line in protocol_table(result, sequence.depth_is_relative):
-        say(line)
-    if outliers := result.outlier_frames():
-        frames = ", ".join(map(str, outliers))
-        look = f". To see them: `{command('render', run, '--split', split)}`" if run else ""
-        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median{look}")
-    say(f"all scores: {file}; what they mean: {page('scores.md')}")
+
+def protocol_table(result: Evaluation, relative: bool = False) -> list[str]:
+    """The lines of the blocks: scores and tags, then what differs and why scores have no value; else nothing."""
+    lines: list[str] = []
+    ours = {"scores": result.scores, "tags": result.protocol["tags"]}
+    scored = [name for name, about in result.protocols.items() if about["tags"]]
+    for start in range(0, len(scored), COLUMNS):
+        some = {name: result.protocols[name] for name in scored[start : start + COLUMNS]}
+        lines += ["", *_block({"ours": ours} | some, relative)]
+    left_out: dict[tuple[str, str], list[str]] = {}
+    """Scores and reason -> protocols."""
+    for name, about in result.protocols.items():
+        published = [f"{KEYS[tag]}: {text}" for tag, text in about["paper"].items() if text != about["tags"].get(tag)]
+        lines += ["", f"{name}: {about['title']} ({about['source']})", "  as published: " + "; ".join(published)]
+        lines += [f"  {sentence}" for sentence in about["differs"]]
+        for reason in dict.fromkeys(about["skipped"].values()):
+            labels = ", ".join(SCORES[score].label for score, why in about["skipped"].items() if why == reason)
+            left_out.setdefault((labels, reason), []).append(name)
+    skipped = [f"  not computed: {scores} ({', '.join(who)}): {why}" for (scores, why), who in left_out.items()]
+    return [*lines, "", *skipped] if skipped else lines
+
+
+def _block(columns: Mapping[str, Mapping[str, Any]], relative: bool) -> list[str]:
+    rows = [("protocol", [*columns])]
+    for name, score in SCORES.items():
+        values = [column["scores"].get(name) for column in columns.values()]
+        if any(value is not None for value in values[1:]):
+            texts = ["-" if value is None else f"{value:,.{score.digits}f}" for value in values]
+            rows.append((score.heading(relative), texts))
+    rows += [(label, [column["tags"].get(tag, "-") for column in columns.values()]) for tag, label in KEYS.items()]
+    return [(label.ljust(NAME) + "".join(f"{text:<{WIDTH - 1}} " for text in texts)).rstrip() for label, texts in rows]

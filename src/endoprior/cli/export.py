@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.checks import input_error
+from ..data.reading import kind_of
 from ..export.formats import ExportOptions
 from ..system.console import say
-from .arguments import Help, parse
-from .paths import folder_of, open_gaussians, sequence_of
+from .arguments import Command
+from .paths import folder_of, open_gaussians, sequence_if_there
 from .progress import Counting
 
 if TYPE_CHECKING:
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(ExportOptions):
+class Export(ExportOptions, Command):
     """Write a trained scene in a format that other programs read (docs/export.md)."""
 
     run: Path = field(metadata={"place": "RUN"})
@@ -29,80 +31,51 @@ class Export(ExportOptions):
     overwrite: bool = False
     """Replace OUT if it is a file that exists."""
 
+    examples = (
+        "RUN tissue.ply --times 0.5",
+        "RUN tissue.obj --times 0.5",
+        "RUN OUT --format mesh --split test",
+        "RUN for_blender.glb --format animation",
+        "RUN player.html",
+    )
+    basics = "--format --mesh-format --frame --overwrite --times --split --canonical --mesh-method --min-alpha --points"
 
-HELP = Help(
-    examples=(
-        ("RUN", "tissue.ply", "--times", "0.5"),
-        ("RUN", "tissue.obj", "--times", "0.5"),
-        ("RUN", "OUT", "--format", "mesh", "--split", "test"),
-        ("RUN", "for_blender.glb", "--format", "animation"),
-        ("RUN", "player.html"),
-    ),
-    basics={
-        "what to write": ("--format", "--mesh-format", "--frame", "--overwrite"),
-        "which times": ("--times", "--split", "--canonical"),
-        "details": ("--mesh-method", "--min-alpha", "--points"),
-    },
-)
+    def execute(self) -> None:
+        """Export."""
+        from ..export import export
+        from ..export.exporting import format_name
+        from ..export.formats import load_format
 
+        given = {each.name: getattr(self, each.name) for each in fields(ExportOptions)}
+        scene = open_gaussians(self.run)
+        if not self.overwrite and kind_of(self.out) == "a file":
+            raise input_error(self.out, "a new file", "one that exists", "Choose another name, or add --overwrite.")
+        name = format_name(self.out, ExportOptions(**given))
+        chosen = load_format(name)
+        if "data" in chosen.options:
+            without = "there are no tool masks, and tools hide no point"
+            sequence = sequence_if_there(scene, folder_of(self.run), self.data, without)
+            given["data"] = sequence and sequence.path
+        options = ExportOptions(**given)
+        with Counting() as progress:
+            written = export(scene, self.out, options, partial(progress, "exporting"))
+        for path in written:
+            say(f"{path}: {self._words(scene, name, chosen)}")
+        if scene.config.render.color_slopes and chosen.holds == "Gaussians":
+            say("note: this format knows one color for each Gaussian, so its pictures are less sharp (docs/export.md).")
+        if chosen.note:
+            say(f"note: {chosen.note(scene, self.out, options)}")
+        if scene.lengths_are_relative:
+            say("note: the scale of this scene is assumed. Its lengths are not millimeters.")
 
-def run(argv: list[str]) -> None:
-    """Export."""
-    args = parse(Export, argv, "export", HELP)
-    from ..export import export
-    from .paths import require_new_file
+    def _words(self, scene: Scene, name: str, chosen: Format) -> str:
+        """What was written; without --format also what else a file of this suffix can hold, and how to get that."""
+        from ..export.formats import formats_of, load_format
 
-    options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
-    scene = open_gaussians(args.run)
-    if not args.overwrite:
-        require_new_file(args.out)
-    options = _with_data(scene, args.run, args.out, options)
-    with Counting() as progress:
-        written = export(scene, args.out, options, partial(progress, "exporting"))
-    for path in written:
-        say(f"{path}: {_words(scene, path, options)}")
-    if scene.config.render.color_slopes and _holds(args.out, options) == "Gaussians":
-        say("note: this format knows one color for each Gaussian, so its pictures are less sharp (docs/export.md).")
-    if note := _chosen(args.out, options)[1].note:
-        say(f"note: {note(scene, args.out, options)}")
-    if scene.lengths_are_relative:
-        say("note: the scale of this scene is assumed. Its lengths are not millimeters.")
-
-
-def _with_data(scene: Scene, run: Path, out: Path, options: ExportOptions) -> ExportOptions:
-    """`options` with the sequence folder of the run, for a format that uses it; with a note if there is none."""
-    if "data" not in _chosen(out, options)[1].options:
-        return options
-    sequence = sequence_of(scene, folder_of(run), options.data, "there are no tool masks, and tools hide no point")
-    return replace(options, data=sequence and sequence.path)
-
-
-def _chosen(out: Path, options: ExportOptions) -> tuple[str, Format]:
-    """The format's name, and the format."""
-    from ..export.exporting import format_name
-    from ..export.formats import load_format
-
-    name = format_name(out, options)
-    return name, load_format(name)
-
-
-def _holds(out: Path, options: ExportOptions) -> str:
-    """What the format holds, in plain words."""
-    name, chosen = _chosen(out, options)
-    return chosen.holds or name
-
-
-def _words(scene: Scene, out: Path, options: ExportOptions) -> str:
-    """What was written; without --format also what else a file of this suffix can hold, and how to get that."""
-    from ..export.formats import formats_of, load_format
-
-    (name, chosen), holds = _chosen(out, options), _holds(out, options)
-    # Of several windows, a time shows one or two.
-    count = f"{len(scene):,} " if holds == "Gaussians" and len(scene.windows) == 1 else ""
-    words = f"{count}{holds}"
-    if out.is_dir():
-        words += ", one file for each time step" if chosen.files else ""
-    elif options.format is None:
-        others = [other for other in formats_of(out.suffix) if other != name]
-        words += "".join(f"; for {load_format(other).holds or other}: --format {other}" for other in others)
-    return words
+        # Of several windows, a time shows one or two.
+        counts = chosen.holds == "Gaussians" and len(scene.windows) == 1
+        words = f"{len(scene):,} Gaussians" if counts else chosen.holds or name
+        if self.out.is_dir():
+            return words + (", one file for each time step" if chosen.files else "")
+        others = [other for other in formats_of(self.out.suffix) if other != name] if self.format is None else []
+        return words + "".join(f"; for {load_format(other).holds or other}: --format {other}" for other in others)

@@ -1,19 +1,27 @@
-"""`endoprior prepare VIDEO OUT`."""
+"""`endoprior prepare VIDEO OUT` and `endoprior poses DATA`: sequence folders from videos, and their camera paths."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ..core.shell import command
+from ..core.checks import check_range, number_ranges
+from ..core.geometry import Convention
 from ..prepare.config import PrepareConfig
 from ..system.console import say
-from .arguments import Help, parse
+from .arguments import Command
 from .progress import Counting
+
+if TYPE_CHECKING:
+    from ..prepare.folder_path import FolderPath
+
+TRUTH = Path("truth", "camera_to_world.npy")
 
 
 @dataclass
-class Prepare:
+class Prepare(Command):
     """Write a sequence folder from an endoscope video: rectified frames, depth, tool masks and camera poses.
 
     To resume after an interruption, run the same command again. Your video never leaves this computer. Of its metadata
@@ -26,32 +34,80 @@ class Prepare:
     """Sequence folder to write; must be new or empty."""
     config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
+    examples = (
+        "video.mp4 DATA",
+        "stereo.mp4 DATA --calibration calib.yaml",
+        "video.mp4 DATA --start 10 --end 20 --frames-per-second 10",
+    )
+    basics = "--calibration --right --start --end --frames-per-second --max-width --depth --masks --poses"
 
-HELP = Help(
-    examples=(
-        ("video.mp4", "DATA"),
-        ("stereo.mp4", "DATA", "--calibration", "calib.yaml"),
-        ("video.mp4", "DATA", "--start", "10", "--end", "20", "--frames-per-second", "10"),
-    ),
-    basics={
-        "cameras": ("--calibration", "--right"),
-        "frames": ("--start", "--end", "--frames-per-second", "--max-width"),
-        "depth, tools and camera path": ("--depth", "--masks", "--poses"),
-    },
-)
+    def execute(self) -> None:
+        """Prepare the sequence."""
+        from ..data.description import RECORD
+        from ..prepare import prepare
+
+        with Counting() as progress:
+            done = prepare(self.video, self.out, self.config, progress)
+        for note in done.notes:
+            say(f"note: {note}")
+        say(f"note: {done.out / RECORD} holds the path of your video; delete it before you share the folder")
+        say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
+        say("next: `endoprior check DATA` and `endoprior train DATA RUN` with this folder as DATA")
 
 
-def run(argv: list[str]) -> None:
-    """Prepare the sequence."""
-    args = parse(Prepare, argv, "prepare", HELP)
-    from ..data.description import RECORD
-    from ..prepare import prepare
+@dataclass
+class Poses(Command):
+    """Find the camera path of a sequence folder and write it to DATA/poses_bounds.npy and DATA/sequence.json.
 
-    with Counting() as progress:
-        done = prepare(args.video, args.out, args.config, progress)
-    for note in done.notes:
-        say(f"note: {note}")
-    say(f"note: {done.out / RECORD} holds the path of your video; delete it before you share the folder")
-    say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
-    say(f"next: {command('check', done.out)}")
-    say(f"then: {command('train', done.out, 'RUN')}")
+    Poses that this program did not write are kept in DATA/poses_bounds_before.npy. Relative depth is brought to the
+    scale of the path. DATA/camera_path.json holds the method and the uncertainty of each pose.
+    """
+
+    data: Path = field(metadata={"place": "DATA"})
+    """Sequence folder."""
+    poses: str = "auto"
+    """`auto` (static, or estimated if the camera moves), `estimate` (by our own tracks, or by COLMAP if it is installed
+    and explains the frames better), `own`, `colmap`, `auto-own`, `still`, or a file as for `prepare --poses`."""
+    poses_convention: Convention = "opencv"
+    """Meaning of the matrices in the file of --poses, as for `prepare`."""
+    poses_unit_mm: float = 1.0
+    """mm per unit of the positions in the file of --poses: 1000 for m."""
+
+    examples = ("DATA", "DATA --poses estimate")
+
+    def __post_init__(self) -> None:
+        check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
+
+    def execute(self) -> None:
+        """Find the camera path and write it."""
+        from ..data.folder_edits import POSES
+        from ..prepare.camera_path.sequence_path import Reading
+        from ..prepare.folder_path import write_folder_path
+
+        reading = Reading(self.poses_convention, self.poses_unit_mm)
+        with Counting() as progress:
+            found = write_folder_path(self.data, self.poses, partial(progress, "following the camera"), reading=reading)
+        for note in found.notes:
+            say(f"note: {note}")
+        if found.unexplained:
+            say(f"note: no camera pose, or another scene, in frames {number_ranges(found.unexplained)}")
+        if found.kept is not None:
+            say(f"note: the poses that were there are kept in {found.kept}")
+        if (self.data / TRUTH).exists():
+            _say_errors(self.data / TRUTH, found)
+        say(f"{self.data / POSES}: {len(found.camera_to_world)} poses")
+        say("next: `endoprior check DATA`")
+
+
+def _say_errors(truth: Path, found: FolderPath) -> None:
+    """Compare with the true path."""
+    from ..evaluation.scorers.camera_path import trajectory_errors
+    from ..prepare.camera_path.pose_file import read_poses
+
+    true = read_poses(truth, len(found.camera_to_world))
+    errors = trajectory_errors(found.camera_to_world, true, with_scale=found.relative)
+    aligned = "Sim(3)" if found.relative else "SE(3)"
+    say(
+        f"against the true path, aligned by {aligned}: {errors.ate_mm:.2f} mm (ATE), {errors.rpe_mm:.2f} mm and "
+        f"{errors.rpe_deg:.3f} degrees from frame to frame, {errors.rotation_error_deg:.2f} degrees in all"
+    )

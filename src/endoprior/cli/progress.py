@@ -6,6 +6,7 @@ import sys
 import time as clock
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Self
 
 from ..core.checks import printable
 from ..runs.progress import PLAIN_EVERY_SECONDS
@@ -22,7 +23,7 @@ class Counting:
         """Args: head: stands in front of each line."""
         self._head, self._what, self._width, self._terminal = head, "", 0, sys.stderr.isatty()
 
-    def __enter__(self) -> Counting:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -41,10 +42,7 @@ class Counting:
         if total and done > self._first:
             seconds = (now - self._began) / (done - self._first)
             line += f"  {1 / max(seconds, 1e-9):.1f}/s  {duration((total - done) * seconds)} left"
-        if self._terminal:
-            self._replace_line(line)
-        else:
-            say(line)
+        (self._replace_line if self._terminal else say)(line)
 
     def _replace_line(self, line: str) -> None:
         """Overwrite the line of a terminal, without escape codes: older consoles of Windows print them."""

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..core.checks import input_error
 from ..system.console import say
-from .arguments import Help, parse
+from .arguments import Command
 from .devices import Wanted, on_device
-from .paths import folder_of, open_scene, reject_without_gaussians
+from .paths import folder_of, open_scene, require_writable_folder, sequence_of, with_gaussians
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene
 
 
 @dataclass
-class Render:
+class Render(Command):
     """Render a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4.
 
     With `--layer texture` it writes texture/*.png and texture.mp4: a grid painted on the first frame, carried by the
@@ -48,100 +49,77 @@ class Render:
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
+    examples = (
+        "RUN",
+        "RUN OUT --split test",
+        "RUN OUT --camera sway",
+        "RUN OUT --layer texture",
+        "RUN OUT --layer support",
+        "RUN OUT --no-highlights",
+    )
 
-HELP = Help(
-    examples=(
-        ("RUN",),
-        ("RUN", "OUT", "--split", "test"),
-        ("RUN", "OUT", "--camera", "sway"),
-        ("RUN", "OUT", "--layer", "texture"),
-        ("RUN", "OUT", "--layer", "support"),
-        ("RUN", "OUT", "--no-highlights"),
-    ),
-)
+    def execute(self) -> None:
+        """Load the scene and render it."""
+        self._reject_two_choices()
+        self.render(open_scene(self.run))
 
+    def _reject_two_choices(self) -> None:
+        """One option alone says which times are rendered, and one from where: a second one would have no effect."""
+        names = ("times", "split", "camera") if self.camera_path else ("split",) if self.times else ()
+        first = "--camera-path" if self.camera_path else "--times"
+        for name in names:
+            if getattr(self, name) != getattr(Render, name):
+                second = f"--{name}"
+                raise input_error(second, f"one of {first} and {second}", "both", f"Remove {first} or {second}.")
+        if bad := [t for t in self.times if not 0 <= t <= 1]:
+            raise input_error("--times", "times in [0, 1]", str(bad[0]), "Correct it; frame i of T is at i / T.")
 
-def run(argv: list[str]) -> None:
-    """Load the scene and render it."""
-    args = parse(Render, argv, "render", HELP)
-    reject_two_choices(args)
-    scene = open_scene(args.run)
-    render(scene, args)
+    def render(self, scene: RenderedScene) -> None:
+        """Render the scene of `run` and print the output paths."""
+        from ..model.highlights import without_highlights
+        from ..system.atomic import removed_on_failure
+        from ..visualization.camera_paths import read_path, sway_path, times_path
+        from ..visualization.rendered_views import depth_span, write_views
+        from ..visualization.tissue_layers import SupportMap, write_support_film, write_texture_film
 
-
-def reject_two_choices(args: Render) -> None:
-    """One option alone says which times are rendered, and one from where.
-
-    Raises:
-        InputError: a second one was given; it would have no effect.
-    """
-    times, split, camera = args.times != (), args.split != Render.split, args.camera != Render.camera
-    path = args.camera_path is not None
-    pairs = {("--camera-path", "--times"): path and times, ("--camera-path", "--split"): path and split,
-             ("--camera-path", "--camera"): path and camera, ("--times", "--split"): times and split}  # fmt: skip
-    for (first, second), both in pairs.items():
-        if both:
-            raise input_error(second, f"one of {first} and {second}", "both", f"Remove {first} or {second}.")
-
-
-def render(scene: RenderedScene, args: Render) -> None:
-    """Render the views selected by `args` and print the output paths."""
-    from .paths import require_writable_folder
-
-    run = folder_of(args.run)
-    require_writable_folder("OUT" if args.out else "RUN", args.out or run)
-    if args.layer != "color" or not args.highlights:
-        reject_without_gaussians(scene, args.run)
-    scene = on_device(scene, args.device, fp16_planes=True)
-    from ..data import load_sequence
-    from ..evaluation.scoring import scored_data
-    from ..model.highlights import without_highlights
-    from ..runs.folder import sequence_of_run
-    from ..system.atomic import removed_on_failure
-    from ..visualization.camera_paths import read_path, sway_path, times_path
-    from ..visualization.rendered_views import depth_span, write_views
-    from ..visualization.tissue_layers import SupportMap, write_support_film, write_texture_film
-
-    frames, sequence, total = None, None, len(scene.cameras)
-    if bad := [t for t in args.times if not 0 <= t <= 1]:
-        raise input_error("--times", "times in [0, 1]", str(bad[0]), "Correct it; frame i of T is at i / T.")
-    if args.layer == "support" or not args.highlights or not (args.camera_path or args.times):
-        sequence = load_sequence(args.data or sequence_of_run(run), scored_data(scene.config.data))
-        if len(sequence) != total:
-            fix = "`--data FOLDER` with the sequence of the run."
-            raise input_error(sequence.path, f"{total} frames", str(len(sequence)), fix)
-    if not args.highlights:
-        scene = without_highlights(scene, sequence.training_part)
-    if args.camera_path:
-        views = read_path(args.camera_path, scene.cameras)
-    else:
-        times = list(args.times)
-        if not times:
-            frames = sequence.frames(args.split)
-            times = [index / total for index in sequence.indices(args.split)]
-        if args.camera == "sway":
-            frames = None
-            views = sway_path(times, scene.cameras, sum(depth_span(scene)) / 2)
+        run, frames = folder_of(self.run), None
+        require_writable_folder("OUT" if self.out else "RUN", self.out or run)
+        if self.layer != "color" or not self.highlights:
+            with_gaussians(scene, self.run)
+        out, video = self._places(run)
+        scene = on_device(scene, self.device, fp16_planes=True)
+        sequence = cache(partial(sequence_of, scene, run, self.data))  # which times alone do not need
+        if not self.highlights:
+            scene = without_highlights(with_gaussians(scene, self.run), sequence().training_part)
+        times = list(self.times)
+        if not times and not self.camera_path:
+            frames, total = sequence().frames(self.split), len(scene.cameras)
+            times = [index / total for index in sequence().indices(self.split)]
+        if self.camera_path:
+            views = read_path(self.camera_path, scene.cameras)
+        elif self.camera == "sway":
+            frames, views = None, sway_path(times, scene.cameras, sum(depth_span(scene)) / 2)
         else:
             views = times_path(times, scene.cameras)
-    beside = not args.highlights and not args.out  # what is there with highlights is kept
-    out = args.out or run / "renders"
-    video = (args.out or run) / ("video.mp4" if args.layer == "color" else f"{args.layer}.mp4")
-    if not args.out and out.is_symlink():  # in an untrusted run the link could point anywhere
-        raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
-    if beside:
-        out, video = out / "no_highlights", video.with_stem(f"{video.stem}_no_highlights")
-    with removed_on_failure(args.out or out):
-        if args.layer == "color":
-            write_views(scene, views, out, video, frames)
-        elif args.layer == "texture":
-            out /= "texture"
-            write_texture_film(scene, views, out, video, frames)
-        else:
-            out /= "support"
-            support = SupportMap(scene, sequence.training_part)
-            write_support_film(support, views, out, video, scene.frames_per_second, frames)
-    images = out / "rgb" if args.layer == "color" else out
-    if (others := len(list(images.glob("*.png"))) - len(views)) > 0:
-        say(f"note: other images were in {images} before: {others}")
-    say(f"{len(views)} frames: {out}\nvideo: {video}")
+        images = out / {"color": "rgb"}.get(self.layer, self.layer)
+        with removed_on_failure(self.out or out):
+            if self.layer == "color":
+                write_views(scene, views, out, video, frames)
+            elif self.layer == "texture":
+                write_texture_film(with_gaussians(scene, self.run), views, images, video, frames)
+            else:
+                support = SupportMap(with_gaussians(scene, self.run), sequence().training_part)
+                write_support_film(support, views, images, video, scene.frames_per_second, frames)
+        if (others := len(list(images.glob("*.png"))) - len(views)) > 0:
+            say(f"note: other images were in {images} before: {others}")
+        say(f"{len(views)} frames: {out if self.layer == 'color' else images}\nvideo: {video}")
+
+    def _places(self, run: Path) -> tuple[Path, Path]:
+        """The folder for images and the file of the video; what is there with highlights is kept."""
+        out = self.out or run / "renders"
+        video = (self.out or run) / ("video.mp4" if self.layer == "color" else f"{self.layer}.mp4")
+        if not self.out and out.is_symlink():  # in an untrusted run the link could point anywhere
+            raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
+        if self.highlights or self.out:
+            return out, video
+        return out / "no_highlights", video.with_stem(f"{video.stem}_no_highlights")

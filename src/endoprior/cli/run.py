@@ -8,22 +8,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.checks import input_error
-from ..core.config import Config
-from ..core.shell import command, command_of
-from ..model.presets import PresetName, preset
+from ..model.presets import preset, preset_names
 from ..prepare.config import PrepareConfig
 from ..system.console import say
-from .arguments import Help, parse
+from .arguments import Command
 from .devices import Wanted, with_device
 from .progress import duration, step_head, step_progress
+from .train import require_gaussians
 
 if TYPE_CHECKING:
     from ..pipeline import Job
 
 
 @dataclass
-class Run:
+class Run(Command):
     """From a video to a model to look at, in one command: prepare, check, train, score, video and player.
 
     OUT gets player.html (open it in a browser), video.mp4, report.png, check.png, data/ and run/. To resume after an
@@ -36,7 +34,7 @@ class Run:
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
     """A first look in about a minute: at most 60 frames, 320 px wide. Not for scores."""
-    preset: PresetName = "default"
+    preset: str = field(default="default", metadata={"choices": preset_names()})
     """Preset of the training; --preview has its own."""
     seed: int = 0
     """Seed of the training."""
@@ -44,100 +42,54 @@ class Run:
     """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
     config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
+    examples = ("video.mp4 OUT --preview", "video.mp4 OUT", "stereo.mp4 OUT --calibration calib.yaml")
+    basics = "--preview --start --end --calibration --right --depth --masks --preset --device"
 
-HELP = Help(
-    examples=(
-        ("video.mp4", "OUT", "--preview"),
-        ("video.mp4", "OUT"),
-        ("stereo.mp4", "OUT", "--calibration", "calib.yaml"),
-    ),
-    basics={
-        "how much": ("--preview", "--start", "--end"),
-        "cameras": ("--calibration", "--right"),
-        "depth and tools": ("--depth", "--masks"),
-        "training": ("--preset", "--device"),
-    },
-)
+    def execute(self) -> None:
+        """Do every step, with one progress display."""
+        from ..pipeline import STEPS, notes_of, open_folder, problems, run_step
+        from ..runs import kernel_cache
+        from ..runs.log import missed_tools_line
 
+        began = clock.perf_counter()
+        job = self.job(say)
+        resumes = open_folder(job)
+        say(_part_words(job))
+        waiting, names = [step for step in STEPS if not step.result(job).exists()], [step.name for step in STEPS]
+        if resumes:
+            say(resume_words(names, [step.name for step in waiting]))
+        kernel_cache.fill(job.cfg, say)
+        try:
+            for step in STEPS:
+                if step in waiting:
+                    with step_progress(names, step.name) as progress:
+                        lines = run_step(step, job, progress)
+                else:
+                    say(f"{step_head(names, step.name):<13} done before")
+                    lines = notes_of(step, job)
+                for line in lines or []:
+                    say(f"     {line}")
+        except KeyboardInterrupt:
+            say("Stopped. To resume, run the same command again.")
+            raise
+        say(f"\nDone in {duration(clock.perf_counter() - began)}. Open {job.player} in a browser.")
+        results = {"video": job.rendered_video, "report": job.report, "check": job.figure, "scene": job.run}
+        for what, path in results.items():
+            say(f"  {what:<8}{path}")
+        for line in filter(None, (problems(job), missed_tools_line(job.run, job.data))):
+            say(line)
+        say("To turn and measure it: `endoprior view RUN` with the folder of the scene as RUN")
+        if self.preview:
+            say("For the whole model, run the same command without --preview and with another OUT.")
 
-def run(argv: list[str]) -> None:
-    """Do every step, with one progress display."""
-    args = parse(Run, argv, "run", HELP)
-    from ..pipeline import STEPS, notes_of, open_folder, problems, run_step
-    from ..runs import kernel_cache
-    from ..runs.log import missed_tools_line
+    def job(self, tell: Callable[[str], None]) -> Job:
+        """The job that the arguments ask for; `tell` takes the device that trains, and the reason."""
+        from ..pipeline import make_job
 
-    began = clock.perf_counter()
-    job = job_of(args, say)
-    resumes = open_folder(job)
-    say(_part_words(job))
-    waiting = [step for step in STEPS if not step.result(job).exists()]
-    names = [step.name for step in STEPS]
-    if resumes:
-        say(resume_words(names, [step.name for step in waiting]))
-    kernel_cache.fill(job.cfg, say)
-    try:
-        for step in STEPS:
-            if step in waiting:
-                with step_progress(names, step.name) as progress:
-                    lines = run_step(step, job, progress)
-            else:
-                say(f"{step_head(names, step.name):<13} done before")
-                lines = notes_of(step, job)
-            for line in lines or []:
-                say(f"     {line}")
-    except KeyboardInterrupt:
-        say("Stopped. To resume, run the same command again.")
-        raise
-    say(f"\nDone in {duration(clock.perf_counter() - began)}. Open {job.player} in a browser.")
-    for what, path in (
-        ("video", job.rendered_video),
-        ("report", job.report),
-        ("check", job.figure),
-        ("scene", job.run),
-    ):
-        say(f"  {what:<8}{path}")
-    if line := problems(job):
-        say(line)
-    if line := missed_tools_line(job.run, job.data):
-        say(line)
-    say(f"Turn and measure it: {command('view', job.run)}")
-    if args.preview:
-        say(f"The whole model:     {_whole_command(job)}")
-
-
-def job_of(args: Run, tell: Callable[[str], None]) -> Job:
-    """The job that the arguments ask for.
-
-    Args:
-        tell: takes the device that trains, and the reason.
-    Raises:
-        InputError: the video cannot be read, or the device not be used.
-    """
-    from ..pipeline import make_job
-
-    cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
-    require_gaussians(cfg, f"`{command('prepare', args.video, 'DATA')}`, then `train`, `eval` and `render`.")
-    cfg = with_device(cfg, args.device, tell)
-    return make_job(args.video, args.out, args.config, cfg, preset=args.preset, preview=args.preview)
-
-
-def require_gaussians(cfg: Config, fix: str) -> None:
-    """Reject a method without Gaussians: the report and the player need them.
-
-    Raises:
-        InputError: with this `fix`.
-    """
-    from ..model.method import method_of
-
-    if not method_of(cfg).has_gaussians:
-        raise input_error("--preset", "a method with Gaussians, which all steps need", cfg.method, fix)
-
-
-def _whole_command(job: Job) -> str:
-    """The command for the whole model, with the options of the preview: a stereo video needs its calibration again."""
-    options = {name: words for name, words in job.options.items() if name != "--preview"}
-    return command_of("run", (job.source, Path("OUT")), options)
+        cfg = replace(preset("preview" if self.preview else self.preset), seed=self.seed)
+        require_gaussians(cfg, "`endoprior prepare VIDEO DATA`, then `train`, `eval` and `render`.")
+        cfg = with_device(cfg, self.device, tell)
+        return make_job(self.video, self.out, self.config, cfg, preset=self.preset, preview=self.preview)
 
 
 def _part_words(job: Job) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 MAX_COORDINATE = 1e150
 """mm; squares of larger ones overflow."""
@@ -20,11 +20,11 @@ def nearest(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray[np.float
         (P, k) indices and (P, k) distances, computed in float64.
     """
     places = np.asarray(points, np.float64)
-    num, tree = len(places), cKDTree(places)
+    num, tree = len(places), KDTree(places)
     indices, distances = np.empty((num, k), np.intp), np.empty((num, k))
     rows, asked = np.arange(num), min(k + 2, num)
     while len(rows):
-        far, found = tree.query(places[rows], asked, workers=get_num_threads())
+        far, found = map(np.asarray, tree.query(places[rows], asked, workers=get_num_threads()))
         if not (far[:, 1:] > far[:, :-1]).all() or asked == num:  # the tree returns equally near ones in any order
             far[found == rows[:, None]] = np.inf  # a point itself comes last
             order = np.lexsort((found, far))

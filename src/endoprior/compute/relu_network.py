@@ -123,7 +123,7 @@ class _Blocks(torch.autograd.Function):
                     v_values = threshold_backward(v_values @ weight, hidden[k - 1][rows], 0)
                 elif v_inputs is not None:
                     torch.mm(v_values, weight, out=v_inputs[rows])
-            if v_repeated is not None:
+            if v_inputs is not None and v_repeated is not None:
                 v_inputs[rows, :repeated] += v_repeated
         return None, None, v_inputs, *v_weights, *v_biases
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
 
-from .checks import InputError, read_ranges
+from .checks import InputError, check_range, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
 from .former_config import current_form
@@ -202,7 +202,11 @@ class WindowConfig(Checked):
     """Where a long sequence is cut. A moving camera sees other tissue after a while; memory should not grow."""
 
     longest: Count = 200
-    """Most frames of a window. Fewer need less memory and make more seams; 0: the whole sequence is one window."""
+    """Most frames of a window, at least 4. Fewer need less memory and make more seams; 0: the whole sequence is one."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range("windows.longest", self.longest or 4, 4, 10_000_000)
 
 
 @dataclass(frozen=True)

@@ -82,12 +82,13 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
         raise input_error(where, "an object with fields", type(values).__name__, fix)
     if of_stored := getattr(cls, "of_stored", None):
         values = of_stored(values)
-    hints = _hints(cls)
+    fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType] - cls is a dataclass
+    hints = {field.name: _hints(cls)[field.name] for field in fields}
     unknown = sorted(map(str, set(values) - set(hints)))
     if unknown:
         name = unknown[0] if unknown[0].isidentifier() else repr(unknown[0])
         raise input_error(f"{where}.{name[:80]}", f"one of {', '.join(hints)}", "no such field", "Correct the name.")
-    needed = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING]
+    needed = [f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING]
     if missing := [name for name in needed if name not in values]:
         raise input_error(f"{where}.{missing[0]}", "an entry", "none", "add it.")
     built = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
@@ -99,35 +100,41 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return value if isinstance(value, hint) else from_dict(hint, value, where)
+    """The value as its type wants it: lists become tuples, dicts dataclasses."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if hint is Any:
-        return value
-    if origin is typing.Literal:
-        ok, want = value in args, f"one of {', '.join(map(repr, args))}"
-    elif origin is tuple:
-        ok = isinstance(value, list | tuple) and (args[-1] is Ellipsis or len(value) == len(args))
-        if ok:
-            return tuple(_value(args[0], v, f"{where}[{i}]") for i, v in enumerate(value))
-        want = "a list" if args[-1] is Ellipsis else f"a list of {len(args)}"
-    elif origin is dict:
-        ok, want = isinstance(value, dict) and all(type(key) is str for key in value), "named entries"
-        if ok:
-            return {key: _value(args[1], v, f"{where}.{key}") for key, v in value.items()}
-    elif origin is types.UnionType and any(map(dataclasses.is_dataclass, args)):
-        return None if value is None else _value(next(filter(dataclasses.is_dataclass, args)), value, where)
-    elif origin is types.UnionType:
-        ok, want = value is None or (any(type(value) is a for a in args) and _is_usable(value)), str(hint)
-    elif hint is float:
-        ok, want = type(value) in (int, float) and _is_usable(value), "a finite number"
-    elif hint is int:
-        ok, want = type(value) is int and _is_usable(value), "an integer below 2^63"
-    else:
-        ok, want = type(value) is hint, hint.__name__
+    if origin is types.UnionType and any(map(dataclasses.is_dataclass, args)):
+        if value is None:
+            return None
+        hint, origin = next(filter(dataclasses.is_dataclass, args)), None
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        return value if isinstance(value, hint) else from_dict(hint, value, where)
+    ok, want = _fits(hint, origin, args, value)
     if not ok:
         raise input_error(where, want, _shown(value), "Correct the value.")
+    if origin is tuple:
+        return tuple(_value(args[0], v, f"{where}[{i}]") for i, v in enumerate(value))
+    if origin is dict:
+        return {key: _value(args[1], v, f"{where}.{key}") for key, v in value.items()}
     return value
+
+
+def _fits(hint: Any, origin: Any, args: tuple[Any, ...], value: Any) -> tuple[bool, str]:
+    """Whether a value has its type, but for the elements of a container, and what is expected."""
+    if origin is typing.Literal:
+        return value in args, f"one of {', '.join(map(repr, args))}"
+    if origin is tuple:
+        any_length = args[-1] is Ellipsis
+        fits = isinstance(value, list | tuple) and (any_length or len(value) == len(args))
+        return fits, "a list" if any_length else f"a list of {len(args)}"
+    if origin is dict:
+        return isinstance(value, dict) and all(type(key) is str for key in value), "named entries"
+    if origin is types.UnionType:
+        return value is None or (any(type(value) is a for a in args) and _is_usable(value)), str(hint)
+    numbers = {float: ((int, float), "a finite number"), int: ((int,), "an integer below 2^63")}
+    if hint in numbers:
+        kinds, want = numbers[hint]
+        return type(value) in kinds and _is_usable(value), want
+    return hint is Any or type(value) is hint, getattr(hint, "__name__", str(hint))
 
 
 def _is_usable(value: Any) -> bool:

@@ -24,7 +24,7 @@ def length_unit(relative: bool) -> str:
 
 def camera_to_world(cameras: Iterable[Camera]) -> NDArray[np.float64]:
     """(T, 4, 4) pose of each camera in the world, mm."""
-    return np.linalg.inv(np.stack([camera.world_to_camera for camera in cameras]))
+    return np.linalg.inv(np.stack([camera.world_to_camera for camera in cameras])).astype(np.float64, copy=False)
 
 
 def pixel_centers(width: int, height: int) -> NDArray[np.float32]:

@@ -19,21 +19,13 @@ from .truth import RightEye
 
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
 """(H, W, 3) color 0..255, (H, W) True on usable tissue, (H, W) depth in mm with 0 where it is missing."""
-
-LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6
-"""Range of focal lengths; the principal point, too, lies within the upper one."""
+LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6  # of focal lengths; the upper one also of principal points
 
 
 def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1, having: Sequence[Container[int]] = ()) -> list[int]:
-    """Positions in the folder of the frames to read.
+    """Positions of the frames to read in a folder of `count`, by stride, then first frames, then skipped frames.
 
-    Args:
-        count: frames in the folder.
-        cfg: `stride`, `first_frames`, which counts frames after striding, and `skip_frames`, which counts what is left.
-        own_stride: the dataset's published stride, used where `cfg.stride` is 0.
-        having: frames that are not in all of these, such as those with a mask, are left out.
-    Raises:
-        InputError: `skip_frames` leaves none.
+    Without a stride the dataset's published one counts. Frames that are not in all of `having` are left out.
     """
     kept = range(0, count, cfg.stride or own_stride)
     kept = kept[: cfg.first_frames] if cfg.first_frames else kept
@@ -71,8 +63,7 @@ def assemble(
         files: the other files of the sequence, for its fingerprint.
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
-        right_eye: see `FrameSequence`.
-        mask_folder, mask_files, new_mask_files: see `FrameSequence`; at full size.
+        right_eye, mask_folder, mask_files, new_mask_files: see `FrameSequence`; at full size.
         about: `frames_per_second`, `truth`, `remarks`, `mask_tool_value`, `depth_is_relative`, `sources` of
             `FrameSequence`.
     Raises:
@@ -82,8 +73,16 @@ def assemble(
     if count < 2 or min(width, height) // cfg.shrink < 1:
         hint = "lower data.shrink or data.stride, raise data.first_frames, or shorten data.skip_frames."
         raise input_error(path, "at least 2 frames of 1x1 px", f"{count} of {width}x{height} / {cfg.shrink}", hint)
-
-    _demand_usable(path, cameras)
+    for index, camera in enumerate(cameras):  # finite numbers may still overflow in the renderer
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):
+            want = f"fx, fy, cx, cy up to {MOST_PX:g} px, fx and fy at least {LEAST_FOCAL_PX:g}"
+            got = ", ".join(f"{value:g}" for value in lens)
+            raise input_error(path, want, f"{got} in frame {index}", "correct the intrinsics.")
+        far = np.abs(camera.world_to_camera[:3, 3]).max()
+        if not far <= FARTHEST_MM:
+            want, got = f"cameras within {FARTHEST_MM:g} mm of the origin", f"{far:g} mm in frame {index}"
+            raise input_error(path, want, got, "correct the poses.")
 
     def read_frame(index: int) -> Frame:
         rgb_u8, tissue_mask, measured = decode(index)
@@ -103,16 +102,3 @@ def assemble(
         new_mask_files=list(new_mask_files) if cfg.shrink == 1 else [],
         **about,
     )
-
-
-def _demand_usable(path: Path, cameras: list[Camera]) -> None:
-    """Raise InputError for cameras whose finite numbers would still overflow in the renderer."""
-    for index, camera in enumerate(cameras):
-        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-        if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):
-            got = ", ".join(f"{value:g}" for value in lens)
-            want = f"fx, fy, cx, cy up to {MOST_PX:g} px, fx and fy at least {LEAST_FOCAL_PX:g}"
-            raise input_error(path, want, f"{got} in frame {index}", "correct the intrinsics.")
-        if not np.abs(camera.world_to_camera[:3, 3]).max() <= FARTHEST_MM:
-            got = f"{np.abs(camera.world_to_camera[:3, 3]).max():g} mm in frame {index}"
-            raise input_error(path, f"cameras within {FARTHEST_MM:g} mm of the origin", got, "correct the poses.")

@@ -29,6 +29,8 @@ from .sequence import FrameSequence
 
 TABLE_STEPS_PER_PX = 16
 """Entries of the table that inverts p, per pixel of radius: the error is far below 1/1000 px."""
+FARTHEST = 65535  # stored depth of all at or beyond 100 mm; 0 is outside the image circle or the model
+POSES_HINT = "take pose.txt of the same video: 16 numbers per frame, camera to world."
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Omnidirectional:
         """
         cx, cy = self.cx + 0.5, self.cy + 0.5
         nearest = min(cx, cy, self.width - cx, self.height - cy)
-        return float(self.forward(np.float64(nearest))), cx, cy
+        return float(self.forward(np.asarray(nearest))), cx, cy
 
     def pinhole_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """x and y, (H, W) each, of the original pixel that each pixel of the pinhole image shows (`cv2.remap`).
@@ -100,9 +102,6 @@ CF_HQ190L = Omnidirectional(
     e=-0.00296316513429569,
 )
 """The endoscope of the first edition of C3VD, as its authors calibrated it."""
-FARTHEST = 65535
-"""Stored depth of everything at or beyond 100 mm; 0 is outside the image circle or the model."""
-POSES_HINT = "take pose.txt of the same video: 16 numbers per frame, camera to world."
 
 
 def is_c3vd(path: Path) -> bool:
@@ -114,15 +113,15 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a registered video."""
     images = list_files(path, (".png",), "C3VD", "_color")
     stored = {_number(file): file for file in list_files(path, (".tiff", ".tif"), "C3VD", "_depth")}
-    missing = [file for file in images if _number(file) not in stored]
-    if missing:
+    if missing := [file for file in images if _number(file) not in stored]:
         name = f"{_number(missing[0]):04d}_depth.tiff"
         raise input_error(path / name, f"the depth of {missing[0].name}", "no such file", "unpack the video again.")
     poses = camera_to_world(path / "pose.txt", len(images))
     calibration = path / "config.ini"
     lens = read_lens(calibration) if calibration.exists() else CF_HQ190L
+    size = (lens.width, lens.height)
     height, width = read_color(images[0]).shape[:2]
-    if (width, height) != (lens.width, lens.height):
+    if (width, height) != size:
         hint = "put the camera's width, height, cx, cy, a0, a2, a3, a4, c, d, e into config.ini beside them."
         raise input_error(images[0], f"{lens.width}x{lens.height} px, the calibrated size", f"{width}x{height}", hint)
     try:
@@ -133,22 +132,20 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     kept = kept_frames(len(images), cfg)
     images = [images[i] for i in kept]
     depths = [stored[_number(file)] for file in images]
-    cameras = [
-        Camera(width, height, focal, focal, cx, cy, world_to_camera(poses[i, :3, :3], poses[i, :3, 3])) for i in kept
-    ]
+    moved = [world_to_camera(poses[i, :3, :3], poses[i, :3, 3]) for i in kept]
     mm_per_unit = cfg.depth_unit_mm or 100 / FARTHEST
 
     def decode(index: int) -> Pixels:
         # The nearest depth, so that depths do not mix across an edge; 0 outside of the original, where no tissue is.
-        units = cv2.remap(read_values(depths[index], (width, height)), *maps, cv2.INTER_NEAREST)
+        units = np.asarray(cv2.remap(read_values(depths[index], size), *maps, cv2.INTER_NEAREST), np.float32)
         depth = np.where(units < FARTHEST, units * np.float32(mm_per_unit), np.float32(0))
-        color = read_color(images[index], (width, height))
-        return cv2.remap(color, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), units > 0, depth
+        color = cv2.remap(read_color(images[index], size), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(color, np.uint8), units > 0, depth
 
     return assemble(
         path,
         cfg,
-        cameras,
+        [Camera(width, height, focal, focal, cx, cy, pose) for pose in moved],
         decode,
         images=images,
         files=[*depths, path / "pose.txt", *([calibration] if calibration.exists() else [])],
@@ -190,8 +187,7 @@ def read_lens(path: Path) -> Omnidirectional:
 
 def _number(file: Path) -> int:
     """Frame number in a name such as `12_color.png` or `0012_depth.tiff`."""
-    digits = re.match(r"[0-9]+", file.name)
-    if not digits:
+    if not (digits := re.match(r"[0-9]+", file.name)):
         raise input_error(file, "a name that starts with the frame's number", file.name, "rename or remove it.")
     return int(digits[0])
 

@@ -6,16 +6,17 @@ https://colmap.github.io/format.html describes the files. Binary numbers are lit
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.config import DataConfig
-from .files import IMAGE_SUFFIXES, entries, in_order
+from .files import IMAGE_SUFFIXES, entries
 from .formats import Format
 from .lens import MODELS, Lens
 from .posed_images import PosedImage, load_posed
@@ -24,30 +25,27 @@ from .sequence import FrameSequence
 
 FIX = "export the model again."
 MOST_IMAGES = 1_000_000
-PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-"""Where programs put the model."""
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")  # where programs put the model
+ImageRow = tuple[str, int, NDArray[np.float64]]
+"""Name, camera and pose (qw qx qy qz tx ty tz) of an image."""
+Stored = TypeVar("Stored")
 
 
-@dataclass(frozen=True)
-class StoredCamera:
+class StoredCamera(NamedTuple):
     """One camera as the file has it."""
 
-    model: str
-    """One of `MODELS`, or another word."""
+    model: str  # one of `MODELS`, or another word
     width: int
     height: int
     values: list[float]
 
 
-@dataclass(frozen=True)
-class RegisteredImage:
+class RegisteredImage(NamedTuple):
     """One image of a model."""
 
-    name: str
-    """Its file, below the folder of images."""
+    name: str  # its file, below the folder of images
     lens: Lens
-    world_to_camera: NDArray[np.float64]
-    """(4, 4), OpenCV axes, in units of the model."""
+    world_to_camera: NDArray[np.float64]  # (4, 4), OpenCV axes, in units of the model
 
 
 def read_colmap(folder: Path) -> tuple[list[RegisteredImage], list[Path]]:
@@ -55,10 +53,7 @@ def read_colmap(folder: Path) -> tuple[list[RegisteredImage], list[Path]]:
     suffix = ".bin" if (folder / "images.bin").exists() else ".txt"
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
     lenses = {number: _lens(cameras, each) for number, each in read_cameras(cameras).items()}
-    try:
-        rows = _images_of_bytes(images) if suffix == ".bin" else _images_of_text(images)
-    except (struct.error, IndexError, UnicodeDecodeError):
-        raise _cut(images) from None
+    rows = _read(images, _images_of_bytes, _images_of_text)
     if not rows:
         raise input_error(images, "registered images", "none", FIX)
     found = []
@@ -76,14 +71,17 @@ def read_colmap(folder: Path) -> tuple[list[RegisteredImage], list[Path]]:
 
 def read_cameras(path: Path) -> dict[int, StoredCamera]:
     """The cameras of `cameras.txt` or `cameras.bin` by their numbers."""
+    return _read(path, _cameras_of_bytes, _cameras_of_text)
+
+
+def _read(path: Path, of_bytes: Callable[[bytes], Stored], of_text: Callable[[Path, list[str]], Stored]) -> Stored:
     try:
-        return _cameras_of_bytes(path) if path.suffix == ".bin" else _cameras_of_text(path)
+        if path.suffix == ".bin":
+            return of_bytes(read_bytes(path, "a binary file of COLMAP", FIX).tobytes())
+        lines = [line.strip() for line in read_text(path, "a text file of COLMAP", FIX).splitlines()]
+        return of_text(path, [line for line in lines if line and not line.startswith("#")])
     except (struct.error, IndexError, UnicodeDecodeError):
-        raise _cut(path) from None
-
-
-def _cut(path: Path) -> InputError:
-    return input_error(path, "a model of COLMAP", f"a {path.suffix} file that ends too early", FIX)
+        raise input_error(path, "a model of COLMAP", f"a {path.suffix} file that ends too early", FIX) from None
 
 
 def _lens(path: Path, camera: StoredCamera) -> Lens:
@@ -97,14 +95,9 @@ def _lens(path: Path, camera: StoredCamera) -> Lens:
         raise input_error(path, "a pinhole, radial, OpenCV or fisheye camera", str(error), fix) from None
 
 
-def _lines(path: Path) -> list[str]:
-    text = read_text(path, "a text file of COLMAP", FIX)
-    return [line.strip() for line in text.splitlines() if not line.lstrip().startswith("#")]
-
-
-def _cameras_of_text(path: Path) -> dict[int, StoredCamera]:
+def _cameras_of_text(path: Path, lines: list[str]) -> dict[int, StoredCamera]:
     cameras = {}
-    for line in filter(None, _lines(path)):
+    for line in lines:
         words = line.split()
         try:
             number, width, height = int(words[0]), int(words[2]), int(words[3])
@@ -115,10 +108,9 @@ def _cameras_of_text(path: Path) -> dict[int, StoredCamera]:
     return cameras
 
 
-def _images_of_text(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
-    """Name, camera and pose (qw qx qy qz tx ty tz) of each image; a line with its points follows."""
-    rows = []
-    for line in filter(None, _lines(path)):
+def _images_of_text(path: Path, lines: list[str]) -> list[ImageRow]:
+    rows = []  # a line with its points follows each image
+    for line in lines:
         words = line.split(maxsplit=9)
         if _are_numbers(line.split()):  # x, y, point of each point; some programs leave this line out
             continue
@@ -137,9 +129,8 @@ def _are_numbers(words: list[str]) -> bool:
         return False
 
 
-def _cameras_of_bytes(path: Path) -> dict[int, StoredCamera]:
-    data, cameras = read_bytes(path, "a binary file of COLMAP", FIX).tobytes(), {}
-    (count,), at = struct.unpack_from("<Q", data), 8
+def _cameras_of_bytes(data: bytes) -> dict[int, StoredCamera]:
+    cameras, (count,), at = {}, struct.unpack_from("<Q", data), 8
     for _ in range(min(count, MOST_IMAGES)):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         name = list(MODELS)[model] if 0 <= model < len(MODELS) else f"number {model}"
@@ -149,10 +140,8 @@ def _cameras_of_bytes(path: Path) -> dict[int, StoredCamera]:
     return cameras
 
 
-def _images_of_bytes(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
-    """As `_images_of_text`."""
-    data, rows = read_bytes(path, "a binary file of COLMAP", FIX).tobytes(), []
-    (count,), at = struct.unpack_from("<Q", data), 8
+def _images_of_bytes(data: bytes) -> list[ImageRow]:
+    rows, (count,), at = [], struct.unpack_from("<Q", data), 8
     for _ in range(min(count, MOST_IMAGES)):
         _, *pose, camera = struct.unpack_from("<i7di", data, at)
         end = data.find(b"\0", at + 64)
@@ -166,13 +155,22 @@ def _images_of_bytes(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
     return rows
 
 
+def model_folder(path: Path) -> Path | None:
+    """The folder of the model in a project folder; None if there is none."""
+    for place in PLACES:
+        for suffix in (".bin", ".txt"):
+            if all((path / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+                return path / place
+    return None
+
+
 def is_colmap(path: Path) -> bool:
     """Whether a folder has images and a model, and no poses of its own."""
     return (path / "images").is_dir() and not (path / "poses_bounds.npy").exists() and model_folder(path) is not None
 
 
 def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open the registered images, in the order of their names."""
+    """Open the registered images."""
     model = model_folder(path)
     if model is None:
         fix = "pass the folder that holds images/ and sparse/0/."
@@ -183,33 +181,10 @@ def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
     if others := sorted(each.name for each in siblings if each != model and each.name.isdigit()):
         remarks.append(f"{model}: other parts of the model, {', '.join(others)}, are not used")
     posed = [PosedImage(path / "images" / each.name, each.lens, each.world_to_camera) for each in registered]
-    posed = present(model, posed, remarks)
-    own = [file for file in entries(path / "images") if file.suffix.lower() in IMAGE_SUFFIXES]
-    if missing := len({file.name for file in own} - {each.file.name for each in posed}):
+    own = {file.name for file in entries(path / "images") if file.suffix.lower() in IMAGE_SUFFIXES}
+    if missing := len(own - {each.file.name for each in posed}):
         remarks.append(f"{model}: {missing} of {len(own)} images have no pose and are left out")
-    rank = {file: i for i, file in enumerate(in_order(each.file for each in posed))}
-    posed.sort(key=lambda each: rank[each.file])
     return load_posed(path, cfg, model, posed, files, remarks)
-
-
-def present(source: Path, posed: list[PosedImage], remarks: list[str]) -> list[PosedImage]:
-    """The images whose files are there; a remark counts the others."""
-    there = [each for each in posed if each.file.is_file()]
-    if not there:
-        got = f"none of {len(posed)}, such as {posed[0].file}" if posed else "none"
-        raise input_error(source, "images that are there", got, "put the images where the file says.")
-    if len(there) < len(posed):
-        remarks.append(f"{source}: {len(posed) - len(there)} of {len(posed)} images are not there and are left out")
-    return there
-
-
-def model_folder(path: Path) -> Path | None:
-    """The folder of the model in a project folder; None if there is none."""
-    for place in PLACES:
-        for suffix in (".bin", ".txt"):
-            if all((path / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
-                return path / place
-    return None
 
 
 FORMAT = Format(is_colmap, load_colmap)

@@ -20,20 +20,30 @@ from ..core.shell import Options
 from ..system.atomic import write_json
 from .files import read_json
 
-LEAST, MOST = 1e-6, 1e6
-"""Range of every number in the file."""
+LEAST, MOST = 1e-6, 1e6  # range of every number in the file
 TOOLS_FOUND = "tools found"
 """Part of the source of masks that a program found: "tools found in 70% of the samples", "no tools found"."""
 OWN_POSES, COLMAP_POSES = "our own tracks", "COLMAP"
-ESTIMATED_POSES = (OWN_POSES, COLMAP_POSES)
-"""Sources of poses that a program found in the video."""
+ESTIMATED_POSES = (OWN_POSES, COLMAP_POSES)  # sources of poses that a program found in the video
 SIZE_NOT_STATED = "calibration, the size of its images not stated"
 """Source of a lens whose calibration file has no image size: the principal point decided."""
-FORMAT_VERSION = 1
-"""Newest `format_version` this program can read; a file without one is of version 1."""
+FORMAT_VERSION = 1  # newest `format_version` this program can read; a file without one is of version 1
 CORRECT = "correct it or remove it."
-POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of a JSON file is a number that can be used."""
+    return not isinstance(value, bool) and isinstance(value, int | float) and LEAST <= value <= MOST
+
+
+def _is_all(value: Any, kind: type, of: type) -> bool:
+    """Whether a value is a list or a dict, and all in it are of one type; a bool is no int."""
+    return type(value) is kind and all(type(each) is of for each in (value.values() if kind is dict else value))
+
+
+NUMBERS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
 KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
+    **dict.fromkeys(NUMBERS, (f"to be a number in [{LEAST:g}, {MOST:g}]", is_number, CORRECT)),
     "depth_unit": ("mm", lambda unit: unit == "mm", "give mm, and mm per stored unit as depth_scale."),
     "mask_tool_value": ("255 or 0", lambda value: value in (0, 255), "give the one that marks tools."),
     "depth_relative": ("true or false", lambda value: isinstance(value, bool), CORRECT),
@@ -45,10 +55,9 @@ KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
         "update endoprior, or prepare the folder again.",
     ),
 }
-"""Other keys: what is expected, whether a value is that, and the fix."""
+"""What is expected of each key, whether a value is that, and the fix."""
 RECORD = "prepare.json"
-STEPS, NEAR_PX = 40, 0.5
-"""Steps to find a source point in the frame, and how near it they end, px, unless it lies outside of the frame."""
+STEPS, NEAR_PX = 40, 0.5  # to find a source point in the frame, and how near they end, px, unless it lies outside
 
 
 def read_description(path: Path) -> dict[str, Any]:
@@ -56,31 +65,20 @@ def read_description(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     described = {key: value for key, value in read_json(path).items() if value is not None}
-    for key in POSITIVE:
-        value = described.get(key, 1)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not LEAST <= value <= MOST:
-            want = f"{key} to be a number in [{LEAST:g}, {MOST:g}]"
-            raise input_error(path, want, repr(value)[:60], CORRECT)
     for key, (want, is_right, hint) in KEYS.items():
         if key in described and not is_right(described[key]):
-            raise input_error(path, f"{key} {want}", repr(described[key]), hint)
+            raise input_error(path, f"{key} {want}", repr(described[key])[:60], hint)
     return described
-
-
-def _is_all(value: Any, kind: type, of: type) -> bool:
-    """Whether a value is a list or a dict, and all in it are of one type; a bool is no int."""
-    return type(value) is kind and all(type(each) is of for each in (value.values() if kind is dict else value))
 
 
 def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]:
     """A remark if there are `unexplained_frames`; raises InputError if the sequence does not have one of them."""
     marked = described.get("unexplained_frames", [])
-    outside = [index for index in marked if not 0 <= index < count]
-    if outside:
+    if outside := [index for index in marked if not 0 <= index < count]:
         raise input_error(path, f"unexplained_frames in 0..{count - 1}", str(outside[0]), CORRECT)
-    if not marked:
-        return []
-    return [f"{path}: {len(marked)} frames are marked as unexplained, the first is frame {min(marked)}"]
+    return (
+        [f"{path}: {len(marked)} frames are marked as unexplained, the first is frame {min(marked)}"] if marked else []
+    )
 
 
 def intrinsics_of(
@@ -100,10 +98,8 @@ def intrinsics_of(
 class PrepareRecord:
     """How a folder was prepared."""
 
-    video: str
-    """Absolute path of the source."""
-    options: Options
-    """All options that differ from their defaults; paths are absolute."""
+    video: str  # absolute path of the source
+    options: Options  # all options that differ from their defaults; paths are absolute
     source_size: tuple[int, int]
     """(width, height) of one camera's image in the source, px: what `--crop` and `--blank` count."""
     source_px: tuple[tuple[tuple[float, ...], ...], ...]
@@ -152,6 +148,6 @@ def read_record(folder: Path) -> PrepareRecord | None:
         raise InputError(f"{file}: {error}") from None
     widths = {len(row) for row in record.source_px}
     pairs = all(len(point) == 2 for row in record.source_px for point in row)
-    if not pairs or len(widths) != 1 or min(len(record.source_px), *widths, 2) < 2 or min(record.source_size) < 1:
+    if not pairs or len(widths) != 1 or min(len(record.source_px), *widths) < 2 or min(record.source_size) < 1:
         raise input_error(file, "source_px as rows of x, y", "another shape", fix)
     return record

@@ -1,6 +1,8 @@
 """Reader of the EndoNeRF layout, `images/ masks/ depth/ poses_bounds.npy sequence.json`, and of folders with less.
 
-`N` frames. Cheap facts (counts, poses, the description) are checked on loading, files when they are decoded.
+Prepared StereoMIS sequences have `split.json` besides, as EndoPrior-GS writes it; raw ones are recognized only to
+explain how to prepare them. Cheap facts (counts, poses, the description) are checked on loading, files when they are
+decoded. `N` frames.
 """
 
 from __future__ import annotations
@@ -13,50 +15,25 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
+from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import check_frames, intrinsics_of, read_description
-from .files import IMAGE_SUFFIXES, list_files
+from .files import IMAGE_SUFFIXES, list_files, read_json
 from .formats import Format
-from .frame_files import files_of_images, one_per_frame
-from .images import DEPTH_SUFFIXES, read_color, read_depth, read_depth_file, read_tool_mask
-from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, world_to_camera
+from .frame_files import Kind, files_of_images, one_per_frame
+from .images import DEPTH_SUFFIXES, decode_image, read_color, read_depth, read_depth_file, read_tool_mask, read_values
+from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, scale_of, world_to_camera
 from .reading import read_numpy
-from .sequence import FrameSequence
+from .sequence import FrameSequence, is_test_frame
 from .truth import Truth, open_right_eye
 
 POSES = "poses_bounds.npy"
 POSES_HINT = "write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
 STILL_HINT = f"{POSES_HINT[:-1]}; for a static camera, set data.format to plain."
-ROUNDED_PX = 1.0
-"""Scaled images may differ from the exact shape by rounding."""
 ASSUMED_FOCAL = 0.9
 """Focal length in image widths if none is given: a field of view of 58 degrees, typical of endoscopes."""
-
-
-def is_endonerf(path: Path) -> bool:
-    """Whether a folder has stored poses, or PNG files in the three folders that belong to them."""
-    return (path / POSES).exists() or all(any((path / name).glob("*.png")) for name in ("images", "masks", "depth"))
-
-
-def is_without_depth(path: Path) -> bool:
-    """Whether a prepared folder has poses and no depth; that of others may have depth under another name."""
-    written = all((path / name).is_file() for name in (POSES, "sequence.json"))
-    return written and (path / "images").is_dir() and not (path / "depth").exists()
-
-
-def is_plain(path: Path) -> bool:
-    """Whether a folder has images in `images/`."""
-    folder = path / "images"
-    return folder.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in folder.iterdir())
-
-
-def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open a folder of images, with masks, depth and poses if there are any; else the camera is static.
-
-    A remark names everything that is missing and assumed.
-    """
-    return load_endonerf(path, cfg, complete=False)
+RAW_STEREOMIS = "StereoCalibration.ini"
 
 
 def load_endonerf(
@@ -85,19 +62,19 @@ def load_endonerf(
     if len(images) < 2:
         raise input_error(path / "images", "at least 2 frames, 1 to train and 1 to test", "1", "add frames.")
     remarks += [note] if note else []
+
+    def column(name: str, kind: Kind, suffixes: tuple[str, ...], required: bool, missing: str) -> dict[int, Path]:
+        """The file of each image in a folder."""
+        if required or (path / name).is_dir():
+            return files_of_images(path / name, list_files(path / name, suffixes, layout), kind, images, remarks)
+        remarks.append(f"{path / name}: missing{missing}")
+        return {}
+
     mask_folder = "gt_masks" if cfg.use_gt_masks else "masks"
-    masks: dict[int, Path] = {}
-    if complete or cfg.use_gt_masks or (path / mask_folder).is_dir():  # a folder that the user names must exist
-        listed = list_files(path / mask_folder, (".png",), layout)
-        masks = files_of_images(path / mask_folder, listed, "masks", images, remarks)
-    else:
-        remarks.append(f"{path / 'masks'}: missing, every pixel counts as tissue")
-    depths: dict[int, Path] = {}
-    if complete or (path / "depth").is_dir():
-        listed = list_files(path / "depth", (".png",) if complete else DEPTH_SUFFIXES, layout)
-        depths = files_of_images(path / "depth", listed, "depth", images, remarks)
-    else:
-        remarks.append(f"{path / 'depth'}: missing; endoprior prepare adds it")
+    # A folder that the user names must exist.
+    masks = column(mask_folder, "masks", (".png",), complete or cfg.use_gt_masks, ", every pixel counts as tissue")
+    kinds = (".png",) if complete else DEPTH_SUFFIXES
+    depths = column("depth", "depth", kinds, complete, "; endoprior prepare adds it")
     described = (facts or {}) | read_description(path / "sequence.json")
     remarks += check_frames(path / "sequence.json", described, len(images))
     unit = cfg.depth_unit_mm or described.get("depth_scale")
@@ -150,6 +127,14 @@ def load_endonerf(
     )
 
 
+def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
+    """Open a folder of images, with masks, depth and poses if there are any; else the camera is static.
+
+    A remark names everything that is missing and assumed.
+    """
+    return load_endonerf(path, cfg, complete=False)
+
+
 def _cameras(
     path: Path,
     described: dict[str, Any],
@@ -171,7 +156,7 @@ def _cameras(
         flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])
         poses = [world_to_camera(pose[:, :3] * flip, pose[:, 3]) for pose in stored]
         if "fx" not in described:
-            focal = focal_at(path / POSES, stored[0, :, 4], width, height, remarks)
+            focal = focal_at(path / POSES, stored, size, remarks)
     else:
         remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
         if "fx" not in described:
@@ -194,28 +179,85 @@ def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
     return poses
 
 
-def focal_at(path: Path, stored: NDArray[np.float64], width: int, height: int, remarks: list[str]) -> float:
-    """Focal length, px, of images of that size, from the (height, width, focal) of `poses_bounds.npy`.
-
-    Files often hold the size of the original video beside smaller images; then the focal length is scaled, and a remark
-    says so.
-    """
-    old_height, old_width, focal = stored
+def focal_at(path: Path, poses: NDArray[np.float64], size: tuple[int, int], remarks: list[str]) -> float:
+    """Focal length, px, of images of that (width, height), from the first of the stored poses of `poses_bounds.npy`."""
+    height, width, focal = poses[0, :, 4].tolist()
     if focal <= 0:
         raise input_error(path, "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
-    if (old_width, old_height) == (width, height):
-        return float(focal)
-    got, scale = f"{old_width:g}x{old_height:g}", width / old_width if old_width > 0 else 0.0
-    if abs(scale * old_height - height) > ROUNDED_PX or not scale:
-        fix = "write the size and focal length of these images there, or fx, fy, cx, cy into sequence.json."
-        raise input_error(path, f"the size of the images, {width}x{height} px, or that shape", got, fix)
-    remarks.append(
-        f"{path}: its focal length, {focal:g} px, is for {got} px; scaled to {focal * scale:g} px for {width}x{height}"
-    )
-    return float(focal * scale)
+    fix = "write the size and focal length of these images there, or fx, fy, cx, cy into sequence.json."
+    return focal * scale_of(path, (width, height), size, focal, fix, remarks)
+
+
+def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
+    """Open a prepared StereoMIS sequence; poses are in mm and masks mark tools.
+
+    8-bit depth is Omnidata's relative depth of unknown scale; 16-bit depth is in mm.
+    """
+    if not (path / "images").is_dir():
+        videos = sorted(path.glob("*.mp4"))
+        options: list[str | Path] = ["--calibration", path / RAW_STEREOMIS, "--layout", "top-bottom"]
+        options += ["--masks", path / "masks", "--mask-tool-value", "low"] if (path / "masks").is_dir() else []
+        options += ["--poses", path / "groundtruth.txt"] if (path / "groundtruth.txt").is_file() else []
+        fix = command("prepare", videos[0] if videos else path / "VIDEO.mp4", "OUT", *options)
+        raise input_error(path / RAW_STEREOMIS, "a prepared sequence", "a raw one", f"`{fix}`.")
+    files = list_files(path / "images", (".png",), "StereoMIS")
+    count = len(files)
+    _check_split(path / "split.json", count)
+    for folder in (path / ("gt_masks" if cfg.use_gt_masks else "masks"), path / "depth"):
+        files = list_files(folder, (".png",), "StereoMIS")
+        if len(files) != count:  # frames that are left out would move the published split
+            fix = "add the missing files, or remove split.json to read the frames that have all."
+            raise input_error(folder, f"{count} files, one per image", f"{len(files)}", fix)
+    facts: dict[str, Any] = {}
+    if decode_image(files[0], None).dtype == np.uint8:
+        facts = {"depth_relative": True, "sources": {"depth": "Omnidata, relative, 8 bits"}}
+    fact_files, lens = [path / "split.json"], path / "intrinsics.npy"
+    if lens.exists():
+        fact_files.append(lens)
+        matrix = read_values(lens)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+            hint = "write the 3x3 camera matrix of the rectified images."
+            raise input_error(lens, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
+        fx, fy, cx, cy = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        facts |= {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5}  # pixel centers of the file are integers
+    return load_endonerf(path, cfg, facts=facts, fact_files=fact_files)
+
+
+def _check_split(path: Path, count: int) -> None:
+    """Raise InputError if the stored split is not the one that this program uses."""
+    split = read_json(path)
+    for key, tests in (("test_indices", True), ("train_indices", False)):
+        stored, indices = split.get(key), [i for i in range(count) if is_test_frame(i) == tests]
+        if not isinstance(stored, list):
+            raise input_error(path, f"a list {key}", repr(stored), "prepare the sequence again.")
+        if stored != indices:
+            want = f"{key} of the rule (i - 1) % 8 == 0, {len(indices)} frames"
+            raise input_error(path, want, f"{len(stored)} frames that differ", "remove split.json to use that rule.")
+
+
+def is_endonerf(path: Path) -> bool:
+    """Whether a folder has stored poses, or PNG files in the three folders that belong to them."""
+    return (path / POSES).exists() or all(any((path / name).glob("*.png")) for name in ("images", "masks", "depth"))
+
+
+def is_stereomis(path: Path) -> bool:
+    """Whether a folder is a StereoMIS sequence, prepared or raw."""
+    return (path / RAW_STEREOMIS).exists() or ((path / "split.json").exists() and (path / "images").is_dir())
+
+
+def is_without_depth(path: Path) -> bool:
+    """Whether a prepared folder has poses and no depth; that of others may have depth under another name."""
+    written = all((path / name).is_file() for name in (POSES, "sequence.json"))
+    return written and (path / "images").is_dir() and not (path / "depth").exists()
+
+
+def is_plain(path: Path) -> bool:
+    """Whether a folder has images in `images/`."""
+    folder = path / "images"
+    return folder.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in folder.iterdir())
 
 
 FORMAT = Format(is_endonerf, load_endonerf)
-NO_DEPTH = Format(is_without_depth, load_plain)
-"""What `endoprior prepare --depth none` leaves, to add depth to."""
+STEREOMIS = Format(is_stereomis, load_stereomis)
+NO_DEPTH = Format(is_without_depth, load_plain)  # what `prepare --depth none` leaves, to add depth to
 PLAIN = Format(is_plain, load_plain)

@@ -14,19 +14,15 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from .reading import ACCESS_HINT, read_text
 
-NUMBER = re.compile(r"[0-9]+")
 DECIMAL = re.compile(r"[0-9]+(?:\.[0-9]+)?")
+# What a file holds, by a word of its name: a mask, a depth map, or something else that is no frame.
 MASK_WORDS = {
     "mask", "masks", "msk", "seg", "segm", "segmentation", "label", "labels", "annotation", "annotations", "watershed",
     "instance", "instances", "semantic", "binary", "gt", "groundtruth", "ids", "matte",
 }  # fmt: skip
-"""A file with one of these words in its name is a mask."""
 DEPTH_WORDS = {"depth", "depths", "disp", "disparity", "z"}
-"""A file with one of these words in its name is a depth map."""
 OTHER_WORDS = {"normal", "normals", "flow", "occlusion", "overlay", "confidence", "uncertainty", "visualization", "vis"}
-"""A file with one of these words in its name is no frame either."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Color images that readers accept."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of color images that readers accept
 
 
 def words_of(stem: str) -> set[str]:
@@ -48,23 +44,17 @@ def sorting_keys(stems: Sequence[str]) -> list[list[int | str] | tuple[str, floa
     """
     if _are_decimals(stems):
         found = [list(DECIMAL.finditer(stem))[-1] for stem in stems]
-        pairs = zip(stems, found, strict=True)
-        return [(stem[: match.start()], float(match[0]), stem[match.end() :]) for stem, match in pairs]
+        return [(m.string[: m.start()], float(m[0]), m.string[m.end() :]) for m in found]
     # Splitting at digits alternates text and number, so that equal positions always compare.
-    split = [re.split(r"([0-9]+)", stem) for stem in stems]
-    return [[int(part) if i % 2 else part for i, part in enumerate(parts)] for parts in split]
+    return [[int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", stem))] for stem in stems]
 
 
 def numbers_of(stems: Sequence[str]) -> list[float] | None:
-    """The number of each name, all different: the last run of digits that differs; a time in seconds as sorted.
-
-    Returns:
-        None if a name has no number, or no run of digits tells the names apart.
-    """
+    """The number of each name: the last run of digits that differs in all, or a decimal; None if there is none."""
     if _are_decimals(stems):
         columns = [[float(DECIMAL.findall(stem)[-1]) for stem in stems]]
     else:
-        rows = [[int(digits) for digits in NUMBER.findall(stem)] for stem in stems]
+        rows = [[int(digits) for digits in re.findall("[0-9]+", stem)] for stem in stems]
         if not all(rows):
             return None
         even = len({len(row) for row in rows}) == 1
@@ -99,36 +89,29 @@ def in_order(files: Iterable[Path]) -> list[Path]:
     """The files of a folder in natural order of their names: 2 before 10, and 0.04 before 0.2 where they are times."""
     listed = list(files)
     keys = sorting_keys([file.stem for file in listed])
-    pairs = zip(keys, [file.suffix for file in listed], listed, strict=True)
-    return [file for _, _, file in sorted(pairs, key=lambda pair: pair[:2])]
+    return [listed[i] for i in sorted(range(len(listed)), key=lambda i: (keys[i], listed[i].suffix))]
 
 
-def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The entries of a folder with one of the suffixes, in natural order; hidden ones do not count."""
-    usable = [file for file in entries(folder) if file.suffix.lower() in suffixes and not file.name.startswith(".")]
-    return in_order(usable)
+def files_with(folder: Path, suffixes: tuple[str, ...], ending: str = "") -> list[Path]:
+    """The entries with one of the suffixes, in lower case, and such a stem, in natural order; hidden ones left out."""
+    return in_order(
+        file
+        for file in entries(folder)
+        if file.suffix.lower() in suffixes and file.stem.endswith(ending) and not file.name.startswith(".")
+    )
 
 
 def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str = "") -> list[Path]:
-    """The files of a folder with one of the suffixes, in natural order; hidden ones do not count.
-
-    Args:
-        folder: where to look.
-        suffixes: in lower case, with the dot.
-        layout: name of the expected layout, for the message.
-        ending: what the stem must end with.
-    """
+    """As `files_with`; InputError if there are none. `layout` is the name of the expected layout."""
     kind = "/".join(sorted({suffix.removeprefix(".").upper() for suffix in suffixes} - {"JPEG", "TIF"}, reverse=True))
     if not folder.is_dir():
         fix = f"pass a folder in the {layout} layout."
         raise input_error(folder, f"a folder of {kind} files", "no such folder", fix)
-    everything = [file for file in entries(folder) if not file.name.startswith(".")]
-    files = [file for file in everything if file.suffix.lower() in suffixes and file.stem.endswith(ending)]
-    if not files:
-        other = sorted({file.suffix for file in everything if file.suffix})
-        got = f"none (only {', '.join(other)})" if other else "none"
-        raise input_error(folder, f"{kind} files", got, f"put one {kind} per frame there.")
-    return in_order(files)
+    if files := files_with(folder, suffixes, ending):
+        return files
+    other = sorted({file.suffix for file in entries(folder) if file.suffix and not file.name.startswith(".")})
+    got = f"none (only {', '.join(other)})" if other else "none"
+    raise input_error(folder, f"{kind} files", got, f"put one {kind} per frame there.")
 
 
 def read_json(
@@ -137,9 +120,9 @@ def read_json(
     """The object in a JSON file; of another `kind`, its list."""
     try:
         stored = json.loads(read_text(path, expected, fix))
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
         raise input_error(path, expected, str(error).split("\n")[0], fix) from None
     if not isinstance(stored, kind):
         raise input_error(path, expected, type(stored).__name__, fix)
@@ -151,16 +134,15 @@ def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, 
     value: Any = stored
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
-    want = f"{key}, {shape[0]}x{shape[1]} numbers"
+    want, fix = f"{key}, {shape[0]}x{shape[1]} numbers", "process the dataset again."
     if value is None:
-        raise input_error(path, want, "no such key", "process the dataset again.")
+        raise input_error(path, want, "no such key", fix)
     try:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != shape or not np.isfinite(matrix).all():
-        got = "NaN or infinity" if matrix.shape == shape else f"shape {matrix.shape}"
-        raise input_error(path, want, got, "process the dataset again.")
+        raise input_error(path, want, "NaN or infinity" if matrix.shape == shape else f"shape {matrix.shape}", fix)
     return matrix
 
 

@@ -17,40 +17,42 @@ from .description import TOOLS_FOUND, read_description
 from .images import read_tool_mask, save_png
 from .sequence import FrameSequence
 
-NOTE = "changes.json"
-"""In the folder of the original masks: the files that were changed, and by how many pixels."""
+NOTE = "changes.json"  # In the folder of the original masks: the files that were changed, and by how many pixels
 POSES, BACKUP = "poses_bounds.npy", "poses_bounds_before.npy"
 
 
 def replace_masks(sequence: FrameSequence, masks: Mapping[int, NDArray[np.bool_]]) -> None:
-    """Write masks to their files. The first original of each is kept in a folder `masks_before` beside them.
+    """Write masks, (H, W) True on tools, to their files; the first original of each goes to `masks_before` beside them.
 
-    Args:
-        sequence: if it has no mask files yet, their folder is made; `masks` must then hold every frame.
-        masks: by frame, (H, W) True on tools.
-    Raises:
-        InputError: as `writable_masks`, or the disk rejects a file; masks written before it stay written.
+    If the sequence has no mask files yet, their folder is made; `masks` must then hold every frame.
     """
-    files = writable_masks(sequence)
+    files, tool_value = writable_masks(sequence), sequence.mask_tool_value
     folder = files[0].parent
     kept = folder.with_name(f"{folder.name}_before")
     folder.mkdir(exist_ok=True)
     for frame, mask in masks.items():
-        file, original = files[frame], kept / files[frame].name
-        if file.exists() and not original.exists():
-            with whole_file(original) as temporary:
-                shutil.copyfile(file, temporary)
-        write_mask(file, mask, sequence.mask_tool_value)
-    if kept.exists():
-        write_json(kept / NOTE, changes(kept, folder, sequence.mask_tool_value))
+        _keep_first(files[frame], kept / files[frame].name)
+        write_mask(files[frame], mask, tool_value)
+    if not kept.exists():
+        return
+    changed = {}
+    for original in sorted(kept.glob("*.png")):
+        before, now = (read_tool_mask(file, tool_value) for file in (original, folder / original.name))
+        changed[original.name] = {"added_px": int((now & ~before).sum()), "removed_px": int((before & ~now).sum())}
+    write_json(kept / NOTE, changed)
+
+
+def _keep_first(file: Path, original: Path) -> bool:
+    """Copy a file that will be replaced, unless there is none, or an older original; returns whether it was copied."""
+    if not file.exists() or original.exists():
+        return False
+    with whole_file(original) as temporary:
+        shutil.copyfile(file, temporary)
+    return True
 
 
 def writable_masks(sequence: FrameSequence) -> list[Path]:
-    """The PNG of each frame's mask; they need not exist yet. Called before long work, too.
-
-    Raises:
-        InputError: the layout does not read masks from files of the frames' size, or the folder is read-only.
-    """
+    """The PNG of each frame's mask; they need not exist yet. InputError if none would be read, or it is read-only."""
     files = sequence.mask_files or sequence.new_mask_files
     if not files:
         fix = "Convert it to a sequence folder, or make a video of it for `endoprior prepare`."
@@ -62,23 +64,13 @@ def writable_masks(sequence: FrameSequence) -> list[Path]:
 
 
 def write_mask(file: Path, mask: NDArray[np.bool_], tool_value: int) -> None:
-    """Write one mask file, atomically.
-
-    Args:
-        mask: (H, W) True on tools.
-        tool_value: value of tools in the file, 255 or 0.
-    """
+    """Write one mask, (H, W) True on tools, atomically; `tool_value` is that of tools in the file, 255 or 0."""
     with whole_file(file) as temporary:
         save_png(temporary, np.where(mask == (tool_value == 255), 255, 0).astype(np.uint8))
 
 
 def note_found_masks(folder: Path, with_tools: float, followed_by: str = "") -> None:
-    """Note in `sequence.json` of a sequence folder that a program found its masks.
-
-    Args:
-        with_tools: share of the frames in which it found tools, 0..1.
-        followed_by: the segmenter that followed them through the video, if any.
-    """
+    """Note in `sequence.json` of a sequence folder that a program found its masks; arguments as `found_source`."""
     path = folder / "sequence.json"
     described = read_description(path)
     sources = described.get("sources", {}) | {"masks": found_source(with_tools, followed_by)}
@@ -86,18 +78,9 @@ def note_found_masks(folder: Path, with_tools: float, followed_by: str = "") -> 
 
 
 def found_source(with_tools: float, followed_by: str = "") -> str:
-    """The source of masks that a program found; the arguments are those of `note_found_masks`."""
+    """The source of masks that a program found in a share of the frames, 0..1, and another followed, if any."""
     found = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
     return f"{found}, followed by {followed_by}" if followed_by else found
-
-
-def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, int]]:
-    """For every original mask in `kept`, how many pixels its corrected version in `folder` adds and removes."""
-    found = {}
-    for original in sorted(kept.glob("*.png")):
-        before, now = (read_tool_mask(file, tool_value) for file in (original, folder / original.name))
-        found[original.name] = {"added_px": int((now & ~before).sum()), "removed_px": int((before & ~now).sum())}
-    return found
 
 
 def pose_table(
@@ -105,10 +88,7 @@ def pose_table(
 ) -> NDArray[np.float64]:
     """(T, 17) rows of `poses_bounds.npy`: 3x5 [R | t | (height, width, focal)], row-major, then near and far.
 
-    Args:
-        camera_to_world: (T, 4, 4) mm, OpenCV axes.
-        focal: px.
-        bounds: (T, 2) nearest and farthest depth, mm.
+    `camera_to_world` is (T, 4, 4) in mm, with OpenCV axes; `bounds` (T, 2) the nearest and farthest depth, mm.
     """
     count = len(camera_to_world)
     size = np.broadcast_to([[height], [width], [focal]], (count, 3, 1))
@@ -129,32 +109,20 @@ def demand_writable(folder: Path) -> None:
 
 
 def replace_poses(folder: Path, table: NDArray[np.float64], described: dict[str, Any], *, ours: bool) -> Path | None:
-    """Write poses and the description of a sequence folder, each atomically.
+    """Write poses, as `pose_table` has them, and the description of a sequence folder, each atomically.
 
-    Args:
-        table: (T, 17), as `pose_table` has it.
-        described: contents of `sequence.json`.
-        ours: the poses there were estimated by this program; others are kept in `poses_bounds_before.npy`.
-    Returns:
-        The file of the old poses, if it was kept.
+    Old poses are kept in `poses_bounds_before.npy`, which is returned, unless they are `ours`: of this program.
     """
     poses, kept = folder / POSES, folder / BACKUP
-    keep = poses.exists() and not ours and not kept.exists()
-    if keep:
-        with whole_file(kept) as temporary:
-            shutil.copyfile(poses, temporary)
+    was_kept = not ours and _keep_first(poses, kept)
     with whole_file(poses) as temporary, temporary.open("wb") as file:
         np.save(file, table)
     write_json(folder / "sequence.json", described)
-    return kept if keep else None
+    return kept if was_kept else None
 
 
 def replace_depth(folder: Path, files: Iterable[tuple[str, NDArray[np.uint16]]]) -> None:
-    """Replace the depth maps of a sequence folder, all or none.
-
-    Args:
-        files: name and (H, W) stored values of each.
-    """
+    """Replace the depth maps of a sequence folder, all or none, by name and (H, W) stored values of each."""
     old, new = folder / "depth", temporary_sibling(folder / "depth")
     aside = temporary_sibling(folder / "depth_old")
     shutil.rmtree(new, ignore_errors=True)

@@ -30,18 +30,15 @@ FORMATS = (
     "plain",  # last: it recognizes every folder with images
 )
 """Modules of this package by the name that `DataConfig.format` takes, in the order in which `auto` tries them."""
-PARTIAL = {"no_depth": "NO_DEPTH", "plain": "PLAIN"}
-"""Layouts that lack parts of EndoNeRF's, which its module reads too."""
+IN_ENDONERF = ("stereomis", "no_depth", "plain")  # names in its module: layouts that have more or less than EndoNeRF's
 
 
 @dataclass(frozen=True)
 class Format:
     """One folder layout."""
 
-    recognizes: Callable[[Path], bool]
-    """Whether a folder has this layout, by the names in it alone."""
-    load: Callable[[Path, DataConfig], FrameSequence]
-    """Opens a folder; raises InputError where it cannot be used."""
+    recognizes: Callable[[Path], bool]  # whether a folder has this layout, by the names in it alone
+    load: Callable[[Path, DataConfig], FrameSequence]  # opens a folder; InputError where it cannot be used
 
 
 def _problem(found: Any) -> str:
@@ -49,18 +46,13 @@ def _problem(found: Any) -> str:
 
 
 def _load(name: str) -> Format:
-    if name in PARTIAL:
-        return getattr(import_module(".endonerf", __package__), PARTIAL[name])
+    if name in IN_ENDONERF:
+        return getattr(import_module(".endonerf", __package__), name.upper())
     return import_module(f".{name}", __package__).FORMAT
 
 
 REGISTRY: Registry[Format] = Registry(
-    "datasets",
-    "a Format of endoprior.data.formats",
-    _problem,
-    modules=FORMATS,
-    load_module=_load,
-    reserved=("auto",),
+    "datasets", "a Format of endoprior.data.formats", _problem, modules=FORMATS, load_module=_load, reserved=("auto",)
 )
 """The layouts above, and those of plugins."""
 

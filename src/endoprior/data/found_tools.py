@@ -16,8 +16,7 @@ from ..system.atomic import write_json
 from .files import read_json
 
 FILE = "tool_masks.json"
-UNCERTAIN = 0.5
-"""Masks of a lower confidence should be looked at."""
+UNCERTAIN = 0.5  # Masks of a lower confidence should be looked at
 WANTED = "a list of frame, share and confidence"
 FIX = "remove the file, or find the tools again: `endoprior masks DATA`."
 
@@ -26,11 +25,9 @@ FIX = "remove the file, or find the tools again: `endoprior masks DATA`."
 class FoundTools:
     """The tools of one frame."""
 
-    mask: NDArray[np.bool_]
-    """(H, W) True on the tools."""
+    mask: NDArray[np.bool_]  # (H, W) True on the tools
     confidence: float
-    """0..1: how far the probabilities of all pixels that may be a tool are from one half, on average; 1 if there are
-    none."""
+    """0..1: how far the probabilities of all pixels that may be a tool are from one half, on average; 1 if none may."""
 
     @property
     def uncertain(self) -> bool:
@@ -42,12 +39,9 @@ class FoundTools:
 class FrameRow:
     """What `FILE` holds of one frame."""
 
-    frame: int
-    """Its place in the whole sequence, from 0."""
-    share: float
-    """Of the image that is tool, 0..1."""
-    confidence: float
-    """As in `FoundTools`."""
+    frame: int  # its place in the whole sequence, from 0
+    share: float  # of the image that is tool, 0..1
+    confidence: float  # as in `FoundTools`
     moves_unmasked: bool = False
     """Whether something enters the view and moves that the mask does not cover; stored only where it is True."""
 
@@ -56,6 +50,23 @@ class FrameRow:
         """The row of a frame in which `found` was found."""
         return cls(frame, float(found.mask.mean()), float(found.confidence))
 
+    @classmethod
+    def read(cls, file: Path, value: Any) -> FrameRow:
+        """The row that a JSON value of the file stands for."""
+        try:
+            row = cls(**value)
+            usable = type(row.frame) is int and row.frame >= 0 and 0 <= row.share <= 1 and 0 <= row.confidence <= 1
+            usable = usable and isinstance(row.moves_unmasked, bool)
+        except TypeError:
+            usable = False
+        if not usable:
+            raise input_error(file, WANTED, f"{value!r:.80}", FIX)
+        return row
+
+    def stored(self) -> dict[str, Any]:
+        """The JSON value."""
+        return {name: value for name, value in asdict(self).items() if name != "moves_unmasked" or value}
+
     def with_added(self, share: float) -> FrameRow:
         """The row when a share of the image, 0..1, is added to the mask."""
         return replace(self, share=min(self.share + share, 1.0), moves_unmasked=self.moves_unmasked and not share)
@@ -63,13 +74,13 @@ class FrameRow:
 
 def write_rows(folder: Path, rows: Iterable[FrameRow]) -> None:
     """Write the rows of a sequence folder."""
-    write_json(folder / FILE, [_stored(row) for row in rows])
+    write_json(folder / FILE, [row.stored() for row in rows])
 
 
 def read_rows(folder: Path) -> list[FrameRow]:
     """The rows of a sequence folder; none if no program found its tools."""
     file = folder / FILE
-    return [_row(file, value) for value in read_json(file, FIX, WANTED, list)] if file.is_file() else []
+    return [FrameRow.read(file, value) for value in read_json(file, FIX, WANTED, list)] if file.is_file() else []
 
 
 def drop_rows(folder: Path, frames: Iterable[int]) -> None:
@@ -96,18 +107,30 @@ class RowLog:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / f"{FILE}l"
-        self.rows: list[FrameRow] = self._read()
+        self.rows: list[FrameRow] = []
+        lines = self._file.read_text(encoding="utf-8", errors="replace").splitlines() if self._file.is_file() else []
+        for line in lines:  # of the interrupted run, up to the first that is not complete
+            try:
+                row = FrameRow(**json.loads(line))
+            except (ValueError, TypeError):
+                break
+            if row.frame != len(self.rows):
+                break
+            self.rows.append(row)
 
     def cut(self, count: int) -> None:
         """Keep the rows of the first `count` frames: the others, and a line cut short, will be written again."""
         self.rows = self.rows[:count]
-        self._file.write_text("".join(map(_line, self.rows)), encoding="utf-8", newline="\n")
+        self._write("w", self.rows)
 
     def add(self, row: FrameRow) -> None:
         """Append a row; it is on the disk before the files of its frame are."""
         self.rows.append(row)
-        with self._file.open("a", encoding="utf-8", newline="\n") as lines:
-            lines.write(_line(row))
+        self._write("a", [row])
+
+    def _write(self, mode: str, rows: list[FrameRow]) -> None:
+        with self._file.open(mode, encoding="utf-8", newline="\n") as lines:
+            lines.writelines(json.dumps(row.stored()) + "\n" for row in rows)
 
     def finish(self) -> None:
         """Write `FILE`."""
@@ -116,37 +139,3 @@ class RowLog:
     def remove(self) -> None:
         """Remove the lines; the folder is complete without them."""
         self._file.unlink(missing_ok=True)
-
-    def _read(self) -> list[FrameRow]:
-        """The rows of an interrupted run, up to the first line that is not complete."""
-        rows: list[FrameRow] = []
-        lines = self._file.read_text(encoding="utf-8", errors="replace").splitlines() if self._file.is_file() else []
-        for line in lines:
-            try:
-                row = FrameRow(**json.loads(line))
-            except (ValueError, TypeError):
-                return rows
-            if row.frame != len(rows):
-                return rows
-            rows.append(row)
-        return rows
-
-
-def _stored(row: FrameRow) -> dict[str, Any]:
-    return {name: value for name, value in asdict(row).items() if name != "moves_unmasked" or value}
-
-
-def _line(row: FrameRow) -> str:
-    return json.dumps(_stored(row)) + "\n"
-
-
-def _row(file: Path, value: Any) -> FrameRow:
-    try:
-        row = FrameRow(**value)
-        usable = type(row.frame) is int and row.frame >= 0 and 0 <= row.share <= 1 and 0 <= row.confidence <= 1
-        usable = usable and isinstance(row.moves_unmasked, bool)
-    except TypeError:
-        usable = False
-    if not usable:
-        raise input_error(file, WANTED, f"{value!r:.80}", FIX)
-    return row

@@ -27,9 +27,11 @@ COUNTED = "matched in order, their numbers are counted otherwise"
 class Series:
     """Files whose names differ in numbers only."""
 
-    name: str
-    """As the files are called, with # in place of a number: `frame_#_mask.png`."""
+    name: str  # as the files are called, with # in place of a number: `frame_#_mask.png`
     files: tuple[Path, ...]
+
+    def __str__(self) -> str:
+        return f"{self.name} ({len(self.files)})"
 
     def is_kind(self, kind: Kind) -> bool:
         """Whether its name says that it holds masks, or depth; or, for images, that it holds nothing else."""
@@ -39,46 +41,31 @@ class Series:
         return bool(words & (MASK_WORDS if kind == "masks" else DEPTH_WORDS))
 
     def shows_frames_of(self, other: Series) -> bool:
-        """Whether both have files of the same frames: most numbers of one are also in the other."""
-        if min(len(self.files), len(other.files)) == 1:
-            return bool({bare(file.stem) for file in self.files} & {bare(file.stem) for file in other.files})
+        """Whether most numbers of one are also in the other; both have several files."""
         numbers = [set(numbers_of([file.stem for file in each.files]) or ()) for each in (self, other)]
         fewer = min(len(each) for each in numbers)
         return bool(fewer) and len(numbers[0] & numbers[1]) > fewer / 2
 
 
-def series_of(files: Sequence[Path]) -> list[Series]:
-    """The series among the files of a folder, in order of their first file."""
+def one_per_frame(folder: Path, files: Sequence[Path], kind: Kind) -> tuple[list[Path], str]:
+    """The files of one kind where a folder has several of a frame, else all; and a note on those left out, or none."""
     found: dict[str, list[Path]] = {}
     for file in files:
         found.setdefault(pattern_of(file.stem) + file.suffix.lower(), []).append(file)
-    return [Series(name, tuple(each)) for name, each in found.items()]
-
-
-def one_per_frame(folder: Path, files: Sequence[Path], kind: Kind) -> tuple[list[Path], str]:
-    """The files of one kind, where a folder has several files of a frame.
-
-    Args:
-        folder: for messages.
-        files: in order.
-        kind: what is looked for.
-    Returns:
-        The files in the same order, and a note on those left out; all files and no note where no frame has two.
-    """
-    every = series_of(files)
+    every = [Series(name, tuple(each)) for name, each in found.items()]
     if not _overlap(every):
         return list(files), ""
     wanted = [series for series in every if series.is_kind(kind)]
     if not wanted or _overlap(wanted):
-        found = ", ".join(f"{series.name} ({len(series.files)})" for series in every[:6])
         more = f" and {len(every) - 6} more" if len(every) > 6 else ""
         fix = "put one of them into a folder of its own, and pass that."
-        raise input_error(folder, f"one series of {kind}, one file per frame", found + more, fix)
+        raise input_error(
+            folder, f"one series of {kind}, one file per frame", ", ".join(map(str, every[:6])) + more, fix
+        )
     kept = {file for series in wanted for file in series.files}
-    out = ", ".join(f"{series.name} ({len(series.files)})" for series in every if series not in wanted)
-    return [
-        file for file in files if file in kept
-    ], f"{folder}: {len(kept)} of {len(files)} files are {kind}; not {out}"
+    out = ", ".join(str(series) for series in every if series not in wanted)
+    note = f"{folder}: {len(kept)} of {len(files)} files are {kind}; not {out}"
+    return [file for file in files if file in kept], note
 
 
 def _overlap(series: Sequence[Series]) -> bool:
@@ -87,7 +74,7 @@ def _overlap(series: Sequence[Series]) -> bool:
     if any(a.shows_frames_of(b) for i, a in enumerate(several) for b in several[:i]):
         return True
     names = [bare(file.stem) for each in series if len(each.files) == 1 for file in each.files]
-    names += sorted({bare(file.stem) for each in several for file in each.files})
+    names += {bare(file.stem) for each in several for file in each.files}
     return len(set(names)) < len(names)
 
 
@@ -95,22 +82,14 @@ def _overlap(series: Sequence[Series]) -> bool:
 class Matched:
     """Which file belongs to which frame."""
 
-    files: dict[int, int]
-    """Position among the files, for each selected position in the source."""
-    rule: str
-    """How it was found, for a note: `by name`."""
+    files: dict[int, int]  # position among the files, for each selected position in the source
+    rule: str  # how it was found, for a note: `matched by name`
 
 
 def match_files(
     folder: Path, suffixes: Sequence[str], what: Kind, indices: Sequence[int], names: Sequence[str] = ()
 ) -> tuple[dict[int, Path], list[str]]:
-    """A file for each selected frame of the source, and notes for the user; as `match_names`.
-
-    Args:
-        folder: files of other types in it are ignored.
-        suffixes: in lower case, with the dot.
-        what: which series is meant, if there are several.
-    """
+    """The file in `folder` of each selected frame, and notes; as `match_names`. `what` tells one of several series."""
     if not folder.is_dir():
         got = "a file" if folder.exists() else "no such folder"
         raise input_error(folder, f"a folder of {what}", got, "Pass the folder that holds one file per frame.")
@@ -121,6 +100,25 @@ def match_files(
     matched = match_names(folder, [file.name for file in files], indices, names)
     notes = [note] if note else []
     return {index: files[position] for index, position in matched.files.items()}, [*notes, f"{what}: {matched.rule}"]
+
+
+def files_of_images(
+    folder: Path, files: Sequence[Path], kind: Kind, images: Sequence[Path], remarks: list[str]
+) -> dict[int, Path]:
+    """The file of each image that has one, by position of the image; files, in order, of another kind are left out.
+
+    `remarks` gets where order decides, and the numbers of images without a file and of files without an image.
+    """
+    files, note = one_per_frame(folder, files, kind)
+    names = [image.stem for image in images]
+    matched = match_names(folder, [file.name for file in files], range(len(images)), names, required=())
+    remarks += [note] if note else []
+    remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []
+    if without := len(images) - len(matched.files):
+        remarks.append(f"{folder}: {without} of {len(images)} images have no file there and are left out")
+    if unused := len(files) - len(matched.files):
+        remarks.append(f"{folder}: {unused} files of other frames are not used")
+    return {index: files[position] for index, position in matched.files.items()}
 
 
 def match_names(
@@ -145,9 +143,17 @@ def match_names(
         required: those of `indices` that must have a file, while others may have none; None: all of them.
         in_order_only: the numbers in the names of the files say nothing about frames.
     """
-    given = _Names(files, names, in_order_only)
+    given = _Names(files, names)
+    if in_order_only:
+        if by_name := given.by_name(indices):
+            return Matched(by_name, BY_NAME)
+        if matched := _in_order(files, names, indices, "their numbers are not those of frames"):
+            return matched
+        hint = "Export one for each frame, or name each file by its frame number."
+        got = f"{len(files)} tasks for {len(required or indices)} frames"
+        raise input_error(folder, "masks of as many tasks as frames", got, hint)
     matched = given.of_all(indices)
-    if matched is None and required is not None and not in_order_only:
+    if matched is None and required is not None:
         matched = given.of_some(folder, indices, required)
         if matched is None and required:
             matched = given.of_all(required)
@@ -155,9 +161,6 @@ def match_names(
         return matched
     wanted, numbers = required or indices, given.numbers
     counts = f"{len(files)} files for {len(wanted)} frames"
-    if in_order_only:
-        hint = "Export one for each frame, or name each file by its frame number."
-        raise input_error(folder, "masks of as many tasks as frames", counts.replace("files", "tasks"), hint)
     if numbers is None:
         want = "one file per frame, or a number of its own in each name"
         raise input_error(folder, want, f"{counts}, such as {files[0]} and {files[-1]}", HINT)
@@ -166,67 +169,51 @@ def match_names(
     raise input_error(folder, "one file per frame", f"{counts}, none numbered {some}", HINT)
 
 
-def files_of_images(
-    folder: Path, files: Sequence[Path], kind: Kind, images: Sequence[Path], remarks: list[str]
-) -> dict[int, Path]:
-    """The file of each image, by position of the image.
-
-    Args:
-        folder: of the files, for messages.
-        files: in natural order; those of another kind are left out.
-        remarks: say where order decides, and count images without a file and files without an image.
-    """
-    files, note = one_per_frame(folder, files, kind)
-    names = [file.name for file in files], [image.stem for image in images]
-    matched = match_names(folder, names[0], range(len(images)), names[1], required=())
-    remarks += [note] if note else []
-    remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []
-    if without := len(images) - len(matched.files):
-        remarks.append(f"{folder}: {without} of {len(images)} images have no file there and are left out")
-    if unused := len(files) - len(matched.files):
-        remarks.append(f"{folder}: {unused} files of other frames are not used")
-    return {index: files[position] for index, position in matched.files.items()}
+def _in_order(files: Sequence[str], names: Sequence[str], indices: Sequence[int], why: str) -> Matched | None:
+    """As many files as selected frames or as images, one for each."""
+    if len(files) == len(indices):
+        return Matched(dict(zip(indices, range(len(files)), strict=True)), f"matched in order, {why}")
+    return Matched({i: i for i in indices}, f"matched in order, {why}") if len(files) == len(names) else None
 
 
 class _Names:
     """The names of some files and of the images that they may belong to, and the rules that find one for the other."""
 
-    def __init__(self, files: Sequence[str], names: Sequence[str], in_order_only: bool) -> None:
-        self.files, self.names, self.in_order_only = files, names, in_order_only
+    def __init__(self, files: Sequence[str], names: Sequence[str]) -> None:
+        self.files, self.names = files, names
         self.stems = [Path(file).stem for file in files]
-        self.numbers = None if in_order_only else numbers_of(self.stems)
-        """The number of each file; None if the names do not tell."""
-        self.own = numbers_of(names) if names else None
-        """The number of each image; None for a video."""
+        self.numbers = numbers_of(self.stems)  # of each file; None if the names do not tell
+        self.own = numbers_of(names) if names else None  # of each image; None for a video
 
     def of_all(self, indices: Sequence[int]) -> Matched | None:
         """A file for every frame; None where the names do not give one to each."""
-        files, names, numbers, own = self.files, self.names, self.numbers, self.own
+        numbers = self.numbers
         if numbers is None:
-            if by_name := self._by_name(indices):
+            if by_name := self.by_name(indices):
                 return Matched(by_name, BY_NAME)
-            why = "their numbers are not those of frames" if self.in_order_only else "each has no number of its own"
-            if len(files) == len(indices):
-                return Matched(dict(zip(indices, range(len(files)), strict=True)), f"matched in order, {why}")
-            return Matched({i: i for i in indices}, f"matched in order, {why}") if len(files) == len(names) else None
-        if by_name := self._by_name(range(len(names))):
+            return _in_order(self.files, self.names, indices, "each has no number of its own")
+        if by_name := self.by_name(range(len(self.names))):
             return Matched({index: by_name[index] for index in indices}, BY_NAME)
-        if own is not None:
-            if {*own} <= {*numbers}:
-                return Matched(_places(numbers, indices, [own[index] for index in indices]), BY_NUMBER)
-            if len(files) == len(names) and _agree(numbers, own):
-                return Matched({index: index for index in indices}, f"{COUNTED}: {files[0]} for image {names[0]}")
-            if by_name := self._by_name(indices):
-                return Matched(by_name, BY_NAME)
+        if self.own is not None and (matched := self._of_images(indices, numbers, self.own)):
+            return matched
         wanted = self.wanted(indices)
         if {*wanted} <= {*numbers}:
             found = _places(numbers, indices, wanted)
-            return Matched(found, BY_NUMBER if own is not None else self._rule_of_positions(found))
-        chosen = wanted if own is not None else list(map(float, indices))
-        if len(files) == len(indices) and _agree(numbers, chosen):
-            shown = f"image {names[indices[0]]}" if names else f"frame {indices[0]}"
-            return Matched(dict(zip(indices, range(len(files)), strict=True)), f"{COUNTED}: {files[0]} for {shown}")
+            return Matched(found, BY_NUMBER if self.own is not None else self._rule_of_positions(found))
+        chosen = wanted if self.own is not None else list(map(float, indices))
+        if len(self.files) == len(indices) and _agree(numbers, chosen):
+            shown = f"image {self.names[indices[0]]}" if self.names else f"frame {indices[0]}"
+            in_order = dict(zip(indices, range(len(self.files)), strict=True))
+            return Matched(in_order, f"{COUNTED}: {self.files[0]} for {shown}")
         return None
+
+    def _of_images(self, indices: Sequence[int], numbers: list[float], own: list[float]) -> Matched | None:
+        if {*own} <= {*numbers}:
+            return Matched(_places(numbers, indices, [own[index] for index in indices]), BY_NUMBER)
+        if len(self.files) == len(self.names) and _agree(numbers, own):
+            return Matched({i: i for i in indices}, f"{COUNTED}: {self.files[0]} for image {self.names[0]}")
+        by_name = self.by_name(indices)
+        return Matched(by_name, BY_NAME) if by_name else None
 
     def of_some(self, folder: Path, indices: Sequence[int], required: Sequence[int]) -> Matched | None:
         """The rule that finds a file for most frames and all that are required; None if there is no such rule."""
@@ -253,13 +240,10 @@ class _Names:
         first = self._starts(indices)[0]
         return [float(index + first) for index in indices]
 
-    def _by_name(self, indices: Sequence[int]) -> dict[int, int] | None:
+    def by_name(self, indices: Sequence[int]) -> dict[int, int] | None:
         """The file called like each image, whatever its words for mask or depth; None if not each has one."""
-        for form in (str, bare) if self.names else ():
-            found = self._named(form, indices)
-            if found and len(found) == len(indices):
-                return found
-        return None
+        found = (self._named(form, indices) for form in ((str, bare) if self.names else ()))
+        return next((each for each in found if each and len(each) == len(indices)), None)
 
     def _named(self, form: Callable[[str], str], indices: Sequence[int]) -> dict[int, int]:
         return _places([form(stem) for stem in self.stems], indices, [form(self.names[index]) for index in indices])
@@ -269,8 +253,7 @@ class _Names:
         numbers = self.numbers or []
         from_zero, from_one = (len({index + first for index in indices} & {*numbers}) for first in (0, 1))
         # Names that begin at 1 are counted from 1; what begins later may be either.
-        is_one = from_one > from_zero or (from_one == from_zero and min(numbers) == 1)
-        return (1, 0) if is_one else (0, 1)
+        return (1, 0) if from_one > from_zero or (from_one == from_zero and min(numbers) == 1) else (0, 1)
 
     def _rule_of_positions(self, found: dict[int, int]) -> str:
         if not found or self.numbers is None:

@@ -20,24 +20,17 @@ from .assemble import Pixels, assemble, kept_frames
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
-from .frame_files import files_of_images
+from .frame_files import Kind, files_of_images
 from .images import read_color, read_depth_file, read_tool_mask
 from .poses import MATRIX_FILE, identity_poses, matrix_of_images, read_camera_matrix
 from .sequence import FrameSequence
 
 FULL_SIZE = (640, 480)
 """(width, height) to which Forplane and EndoGaussian bring every image; that of their `intrinsics.txt`."""
-CROPPED_PX = 40
-"""Empty columns at the left of such an image; their programs crop them, too."""
-SAMPLES = 20
-"""Number of images in which a margin must be black."""
+CROPPED_PX = 40  # empty columns at the left of such an image; their programs crop them, too
+SAMPLES = 20  # images in which a margin must be black
 RECTIFIED = (("image01", "depth01"), ("color", "depth"))
 """Folders of images and depth in the rectified videos: for depth networks, and for tracking."""
-
-
-def is_hamlyn(path: Path) -> bool:
-    """Whether a folder is a Hamlyn sequence; Forplane's have `gt_depth/`, `pred_disp/`, or `hamlyn` in their name."""
-    return _is_forplane(path) or _rectified_folders(path) is not None
 
 
 def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
@@ -54,9 +47,10 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
         mask_folder = "gt_masks" if (path / "gt_masks").is_dir() else "masks"
         depth_folder = next((name for name in ("gt_depth", "pred_disp") if (path / name).is_dir()), "depth")
     images = list_files(path / image_folder, kinds, layout)
+    kinds_of: list[tuple[str, Kind]] = [(depth_folder, "depth"), (mask_folder, "masks")]
     columns = [
         files_of_images(path / folder, list_files(path / folder, (".png",), layout), kind, images, remarks)
-        for folder, kind in ((depth_folder, "depth"), (mask_folder, "masks"))
+        for folder, kind in kinds_of
         if folder
     ]
     height, width = read_color(images[0]).shape[:2]
@@ -110,18 +104,36 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     )
 
 
+def _forplane_matrix(
+    path: Path, size: tuple[int, int], crop: int, count: int, remarks: list[str]
+) -> tuple[NDArray[np.float64], Path]:
+    """(3, 3) K, px with centers at halves, of the images before the crop, and the file that it comes from."""
+    width, height = size
+    stored, poses = path / MATRIX_FILE, path / "poses_bounds.npy"
+    if stored.exists():
+        if poses.exists():
+            remarks.append(f"{poses}: not used; {MATRIX_FILE} is the calibration")
+        return matrix_of_images(stored, read_camera_matrix(stored), size, FULL_SIZE, remarks), stored
+    # All rows must be finite, but only size and focal length are used: Forplane's camera is static.
+    known = read_poses_bounds(poses, count)
+    # Some files hold the size after the crop, which leaves the focal length as it is.
+    across = width - crop if known[0, 1, 4] == width - crop else width
+    focal = focal_at(poses, known, (across, height), remarks)
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), poses
+
+
+def _matrix_file(path: Path) -> Path:
+    """The camera matrix of a rectified video: beside its frames, or with those of the other videos."""
+    number = (re.findall(r"[0-9]+", path.name) or [""])[-1]
+    own = f"intrinsics_rectified{number}.txt"
+    calibration = path.parent / "calibration"
+    places = [path / MATRIX_FILE, path / own, path / "intrinsic" / "intrinsic_color.txt", path.parent / own]
+    places += [calibration / number / MATRIX_FILE, calibration / own]
+    return next((place for place in places if place.is_file()), places[0])
+
+
 def _is_named(path: Path) -> bool:
     return any("hamlyn" in name.lower() for name in (path.name, path.parent.name))
-
-
-def _is_forplane(path: Path) -> bool:
-    if not (path / "images").is_dir():
-        return False
-    own_depth = any((path / name).is_dir() for name in ("gt_depth", "pred_disp"))
-    own_camera = (path / MATRIX_FILE).exists() and ((path / "gt_masks").is_dir() or _is_named(path))
-    # A folder that this program prepared from a Hamlyn video has a sequence.json and no empty columns.
-    bare = (path / "poses_bounds.npy").exists() and not (path / "sequence.json").exists()
-    return own_depth or own_camera or (bare and _is_named(path))
 
 
 def _rectified_folders(path: Path) -> tuple[str, str] | None:
@@ -135,32 +147,15 @@ def _rectified_folders(path: Path) -> tuple[str, str] | None:
     return None
 
 
-def _forplane_matrix(
-    path: Path, size: tuple[int, int], crop: int, count: int, remarks: list[str]
-) -> tuple[NDArray[np.float64], Path]:
-    """(3, 3) K, px with centers at halves, of the images before the crop, and the file that it comes from."""
-    width, height = size
-    stored, poses = path / MATRIX_FILE, path / "poses_bounds.npy"
-    if stored.exists():
-        if poses.exists():
-            remarks.append(f"{poses}: not used; {MATRIX_FILE} is the calibration")
-        return matrix_of_images(stored, read_camera_matrix(stored), size, FULL_SIZE, remarks), stored
-    # All rows must be finite, but only size and focal length are used: Forplane's camera is static.
-    known = read_poses_bounds(poses, count)[0, :, 4]
-    # Some files hold the size after the crop, which leaves the focal length as it is.
-    across = width - crop if known[1] == width - crop else width
-    focal = focal_at(poses, known, across, height, remarks)
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), poses
-
-
-def _matrix_file(path: Path) -> Path:
-    """The camera matrix of a rectified video: beside its frames, or with those of the other videos."""
-    number = (re.findall(r"[0-9]+", path.name) or [""])[-1]
-    own = f"intrinsics_rectified{number}.txt"
-    calibration = path.parent / "calibration"
-    places = [path / MATRIX_FILE, path / own, path / "intrinsic" / "intrinsic_color.txt", path.parent / own]
-    places += [calibration / number / MATRIX_FILE, calibration / own]
-    return next((place for place in places if place.is_file()), places[0])
+def is_hamlyn(path: Path) -> bool:
+    """Whether a folder is a Hamlyn sequence; Forplane's have `gt_depth/`, `pred_disp/`, or `hamlyn` in their name."""
+    if _rectified_folders(path):
+        return True
+    own_depth = any((path / name).is_dir() for name in ("gt_depth", "pred_disp"))
+    own_camera = (path / MATRIX_FILE).exists() and ((path / "gt_masks").is_dir() or _is_named(path))
+    # A folder that this program prepared from a Hamlyn video has a sequence.json and no empty columns.
+    bare = (path / "poses_bounds.npy").exists() and not (path / "sequence.json").exists()
+    return (path / "images").is_dir() and (own_depth or own_camera or (bare and _is_named(path)))
 
 
 FORMAT = Format(is_hamlyn, load_hamlyn)

@@ -29,35 +29,28 @@ from .reading import MOST_PIXELS, demand_file, read_bytes, read_only_array
 
 READERS = {b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"RIFF": WebPImageFile}
 """Pillow's readers, by the first bytes of a file. `PIL.Image.open` has a limit of its own, for the whole process."""
-TIFF_STARTS = (b"II", b"MM")
-"""First bytes of TIFF files: the order of bytes in a number. Pillow's own reader knows fewer kinds of pixels."""
+TIFF_STARTS = (b"II", b"MM")  # the order of bytes in a number. Pillow's own reader knows fewer kinds of pixels
 BIG_TIFF = 43
-JPEG_END = b"\xff\xd9"
-TURNED = range(5, 9)
-"""Orientations that exchange width and height."""
-warnings.filterwarnings("ignore", module=r"PIL\.\w+Plugin")  # of damaged tags, which are read as missing
-PNG_END = b"IEND\xaeB`\x82"
-"""Last bytes of every PNG file."""
+JPEG_END, PNG_END = b"\xff\xd9", b"IEND\xaeB`\x82"
+TURNED = range(5, 9)  # orientations that exchange width and height
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
-"""Suffixes of the files this module reads, in lower case."""
+Size = tuple[int, int]
+warnings.filterwarnings("ignore", module=r"PIL\.\w+Plugin")  # of damaged tags, which are read as missing
 
 
 class ImageHeader(NamedTuple):
     """An image before it is decoded."""
 
-    width: int
-    """Of the image as it is shown, px."""
+    width: int  # of the image as it is shown, px
     height: int
-    orientation: int
-    """How the stored pixels lie, by EXIF: 1 as they are shown, 2 to 8 mirrored or turned; 1 if nothing is said."""
+    orientation: int  # of the stored pixels, by EXIF: 1 as they are shown, or not said; 2 to 8 mirrored or turned
 
 
 def read_header(encoded: bytes) -> ImageHeader | None:
-    """The header of a PNG, JPEG, TIFF, BMP or WebP image.
+    """The header of a PNG, JPEG, TIFF, BMP or WebP image; None if it is none of these, or damaged.
 
-    Returns:
-        None if it is none of these, or damaged. Decoders check the pixels of most kinds, but print to stderr for a PNG
-        with a wrong checksum and a JPEG without its end. What phones and editors add after the end does not count.
+    Decoders check the pixels of most kinds, but print to stderr for a PNG with a wrong checksum and a JPEG without its
+    end. What phones and editors add after the end does not count.
     """
     try:
         if encoded.startswith(TIFF_STARTS):
@@ -72,11 +65,12 @@ def read_header(encoded: bytes) -> ImageHeader | None:
         return None
     if not (isinstance(width, int) and isinstance(height, int)):
         return None
-    orientation = orientation if orientation in range(1, 9) else 1
+    if not isinstance(orientation, int) or orientation not in range(2, 9):
+        return ImageHeader(width, height, 1)
     return ImageHeader(*((height, width) if orientation in TURNED else (width, height)), orientation)
 
 
-def _read_by_pillow(encoded: bytes) -> tuple[tuple[int, int], int | None]:
+def _read_by_pillow(encoded: bytes) -> tuple[Size, int | None]:
     """Stored size, px, and orientation; raises what Pillow raises if the file is damaged."""
     file = io.BytesIO(encoded)
     image = next(reader for start, reader in READERS.items() if encoded.startswith(start))(file)
@@ -92,54 +86,9 @@ def _read_by_pillow(encoded: bytes) -> tuple[tuple[int, int], int | None]:
         return image.size, None
 
 
-def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """(H, W, 3) red, green, blue, 0..255, of an 8-bit color image; an alpha channel is dropped."""
-    pixels = decode_image(path, size)
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-        raise input_error(path, "an 8-bit RGB image", describe_pixels(pixels), "convert it to 8-bit RGB.")
-    return np.ascontiguousarray(pixels[..., 2::-1])
+def decode_image(path: Path, size: Size | None, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray:
+    """Decode a PNG, JPEG, TIFF, BMP or WebP file; `flags` of `cv2.imdecode`: as stored, or converted.
 
-
-def read_tool_mask(path: Path, tool_value: int = 255, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-    """(H, W) True on tools, of an 8-bit image with values 0 and 255 only, gray or with equal channels.
-
-    Args:
-        tool_value: 255, or 0 where the file marks tissue instead of tools.
-    """
-    pixels = single_channel(path, decode_image(path, size))
-    if pixels.dtype != np.uint8:
-        raise input_error(path, "an 8-bit mask", describe_pixels(pixels), "save it with values 0 and 255.")
-    high = pixels == 255
-    other = pixels[~high & (pixels != 0)]
-    if other.size:
-        values = np.unique(other)
-        zero_and_one = values.tolist() == [1] and not high.any()
-        hint = "multiply it by 255." if zero_and_one else "threshold it, without smoothing."
-        got = ", ".join(str(v) for v in values[:4].tolist()) + (" and more" if len(values) > 4 else "")
-        raise input_error(path, "mask values 0 and 255", got, hint)
-    return high if tool_value == 255 else ~high
-
-
-def read_depth(path: Path, scale: float = 1.0, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """(H, W) depth, mm, of an 8-bit or 16-bit image, gray or with equal channels.
-
-    It is 0 where the file has 0, and with 16 bits what else stands for missing (`is_measured`).
-
-    Args:
-        scale: mm per unit of the file.
-    """
-    pixels = single_channel(path, decode_image(path, size))
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise input_error(path, "an 8-bit or 16-bit depth image", describe_pixels(pixels), "save it as 16-bit PNG.")
-    depth = pixels.astype(np.float32) * np.float32(scale)
-    return depth if pixels.dtype == np.uint8 else np.where(is_measured(pixels), depth, np.float32(0))
-
-
-def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray:
-    """Decode a PNG, JPEG, TIFF, BMP or WebP file.
-
-    Args:
-        flags: of `cv2.imdecode`: as stored, or converted.
     Returns:
         The array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first), upright: turned as EXIF says.
     """
@@ -154,20 +103,16 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
         pixels = cv2.imdecode(encoded, flags | cv2.IMREAD_IGNORE_ORIENTATION) if header else None
     except cv2.error:
         pixels = None
-    if pixels is None:
+    if pixels is None or header is None:
         got = f"{encoded.size} bytes that cannot be decoded"
         raise input_error(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "write the file again.")
     if not data.startswith(TIFF_STARTS):  # OpenCV turns TIFF whatever it is told
         pixels = _upright(pixels, header.orientation)
-    got = (pixels.shape[1], pixels.shape[0])
-    if size is not None and got != size:
-        want, fix = f"{size[0]}x{size[1]} px like the first image", "bring all images, masks and depth to one size."
-        raise input_error(path, want, f"{got[0]}x{got[1]}", fix)
+    _demand_size(path, pixels, size)
     return pixels
 
 
 def _upright(pixels: NDArray, orientation: int) -> NDArray:
-    """Stored pixels as they are shown. Args: orientation: 1 to 8, as EXIF counts them."""
     if orientation in TURNED:
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -177,75 +122,66 @@ def _upright(pixels: NDArray, orientation: int) -> NDArray:
     return np.ascontiguousarray(pixels)
 
 
-def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
-    """Write a PNG; OSError if the disk is full, else as `encode_png`.
+def _demand_size(path: Path, pixels: NDArray, size: Size | None) -> None:
+    got = (pixels.shape[1], pixels.shape[0])
+    if size is not None and got != size:
+        want, fix = f"{size[0]}x{size[1]} px like the first image", "bring all images, masks and depth to one size."
+        raise input_error(path, want, f"{got[0]}x{got[1]}", fix)
 
-    It is encoded in memory first, because libpng prints to stderr when the disk is full.
+
+def read_color(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
+    """(H, W, 3) red, green, blue, 0..255, of an 8-bit color image; an alpha channel is dropped."""
+    pixels = decode_image(path, size)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        raise input_error(path, "an 8-bit RGB image", describe_pixels(pixels), "convert it to 8-bit RGB.")
+    return np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def read_tool_mask(path: Path, tool_value: int = 255, size: Size | None = None) -> NDArray[np.bool_]:
+    """(H, W) True on tools, of an 8-bit image with values 0 and 255 only, one of which is that of tools."""
+    pixels = single_channel(path, decode_image(path, size))
+    if pixels.dtype != np.uint8:
+        raise input_error(path, "an 8-bit mask", describe_pixels(pixels), "save it with values 0 and 255.")
+    high = pixels == 255
+    if other := np.unique(pixels[~high & (pixels != 0)]).tolist():
+        zero_and_one = other == [1] and not high.any()
+        hint = "multiply it by 255." if zero_and_one else "threshold it, without smoothing."
+        got = ", ".join(map(str, other[:4])) + (" and more" if len(other) > 4 else "")
+        raise input_error(path, "mask values 0 and 255", got, hint)
+    return high if tool_value == 255 else ~high
+
+
+def read_depth(path: Path, scale: float = 1.0, size: Size | None = None) -> NDArray[np.float32]:
+    """(H, W) depth, mm, of an 8-bit or 16-bit image, gray or with equal channels; `scale` is mm per unit of the file.
+
+    It is 0 where the file has 0, and with 16 bits what else stands for missing (`is_measured`).
     """
-    path.write_bytes(encode_png(pixels, compression))
-
-
-def encode_png(pixels: NDArray, compression: int = 1) -> bytes:
-    """The bytes of a PNG file.
-
-    Args:
-        pixels: (H, W) 8- or 16-bit, or (H, W, 3) 8-bit red, green, blue.
-        compression: 0 to 9.
-    Raises:
-        MemoryError: the encoder stopped; libpng has no other reason with pixels of these types.
-    """
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
-    stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
-    done, encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])
-    if not done or not (data := encoded.tobytes()).endswith(PNG_END):
-        raise MemoryError("a PNG encoder that stopped")
-    return data
-
-
-def single_channel(path: Path, pixels: NDArray) -> NDArray:
-    """(H, W) view of a gray image, or of one stored with equal color channels."""
-    if pixels.ndim == 2:
-        return pixels
-    first = pixels[..., 0]
-    if any((pixels[..., c] != first).any() for c in range(1, min(pixels.shape[2], 3))):
-        raise input_error(path, "one channel", "a color image", "save the values themselves, not a color map.")
-    return first
-
-
-def describe_pixels(pixels: NDArray) -> str:
-    """Type and channels of an array as text, such as '16-bit, 1 channel'."""
-    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    kind = "float" if np.issubdtype(pixels.dtype, np.floating) else f"{8 * pixels.dtype.itemsize}-bit"
-    return f"{kind}, {channels} channel{'s' if channels > 1 else ''}"
+    pixels = single_channel(path, decode_image(path, size))
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise input_error(path, "an 8-bit or 16-bit depth image", describe_pixels(pixels), "save it as 16-bit PNG.")
+    depth = pixels.astype(np.float32) * np.float32(scale)
+    return depth if pixels.dtype == np.uint8 else np.where(is_measured(pixels), depth, np.float32(0))
 
 
 def read_depth_file(
-    path: Path, mm_per_unit: float = 1.0, size: tuple[int, int] | None = None, *, relative: bool = False
+    path: Path, mm_per_unit: float = 1.0, size: Size | None = None, *, relative: bool = False
 ) -> NDArray[np.float32]:
-    """Read a depth image.
-
-    Args:
-        path: PNG or TIFF (8 or 16 bit, TIFF also float), NPY, NPZ with one array, or EXR with one channel.
-        mm_per_unit: mm per stored unit.
-        size: (width, height) it must have, px; None accepts any.
-        relative: the depth is only scaled, see `is_measured`.
-    Returns:
-        (H, W) depth, mm; 0 where it is missing (`is_measured`).
-    Raises:
-        InputError: unreadable, of another size or kind, or EXR without the OpenEXR package.
-    """
+    """(H, W) depth, mm, of a file of `read_stored`; 0 where it is missing (`is_measured`, which takes `relative`)."""
     stored = read_stored(path, size)
     depth = _as_float32(stored) * np.float32(mm_per_unit)
     return np.where(is_measured(stored, relative=relative) & np.isfinite(depth), depth, np.float32(0))
 
 
-def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """(H, W) numbers of a one-channel file, none of them missing; kinds, `size` and errors as `read_depth_file`."""
+def read_values(path: Path, size: Size | None = None) -> NDArray[np.float32]:
+    """(H, W) numbers of a file as `read_stored` reads, none of them missing."""
     return _as_float32(read_stored(path, size))
 
 
-def read_stored(path: Path, size: tuple[int, int] | None = None) -> NDArray:
-    """(H, W) numbers of a one-channel file in their own type; kinds, `size` and errors as `read_depth_file`."""
+def read_stored(path: Path, size: Size | None = None) -> NDArray:
+    """(H, W) numbers of a one-channel file in their own type.
+
+    PNG or TIFF (8 or 16 bit, TIFF also float), NPY, NPZ with one array, or EXR, which needs the OpenEXR package.
+    """
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         raise input_error(path, f"one of {', '.join(DEPTH_SUFFIXES)}", suffix or "no suffix", "convert the file.")
@@ -257,9 +193,7 @@ def read_stored(path: Path, size: tuple[int, int] | None = None) -> NDArray:
         pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype.kind not in "iuf":
         raise input_error(path, "integers or floats", str(pixels.dtype), "save it as float or 16-bit.")
-    if size is not None and pixels.shape != (size[1], size[0]):
-        got = f"{pixels.shape[1]}x{pixels.shape[0]}"
-        raise input_error(path, f"{size[0]}x{size[1]} px like the first image", got, "bring all files to one size.")
+    _demand_size(path, pixels, size)
     return pixels
 
 
@@ -269,10 +203,7 @@ def _as_float32(stored: NDArray) -> NDArray[np.float32]:
 
 
 def _read_numpy(path: Path) -> NDArray:
-    """The (H, W) array of an .npy file, or of an .npz file that holds nothing else; no pickles.
-
-    Axes of length 1 in front of the others or behind them are dropped.
-    """
+    """The (H, W) array; axes of length 1 in front of the others or behind them are dropped."""
     hint = "write it again with numpy.save."
     array = read_only_array(path, hint)
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
@@ -300,8 +231,42 @@ def _read_exr(path: Path) -> NDArray:
         raise input_error(path, "an EXR image", str(error).split("\n")[0], "write the file again.") from None
     if "Z" in channels:
         return channels["Z"]
-    first, *others = [channels[name] for name in channels if name != "A"] or [None]
-    if first is None or any(not np.array_equal(first, other, equal_nan=True) for other in others):
+    planes = [channels[name] for name in channels if name != "A"]
+    if not planes or not all(np.array_equal(planes[0], other, equal_nan=True) for other in planes[1:]):
         hint = "save depth alone, as channel Z."
         raise input_error(path, "one channel, or one called Z", ", ".join(channels) or "none", hint)
-    return first
+    return planes[0]
+
+
+def single_channel(path: Path, pixels: NDArray) -> NDArray:
+    """(H, W) view of a gray image, or of one stored with equal color channels."""
+    if pixels.ndim == 2:
+        return pixels
+    if (pixels[..., 1:3] != pixels[..., :1]).any():
+        raise input_error(path, "one channel", "a color image", "save the values themselves, not a color map.")
+    return pixels[..., 0]
+
+
+def describe_pixels(pixels: NDArray) -> str:
+    """Type and channels of an array as text, such as '16-bit, 1 channel'."""
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    kind = "float" if np.issubdtype(pixels.dtype, np.floating) else f"{8 * pixels.dtype.itemsize}-bit"
+    return f"{kind}, {channels} channel{'s' if channels > 1 else ''}"
+
+
+def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
+    """Write a PNG, encoded in memory first (`encode_png`): libpng prints to stderr when the disk is full."""
+    path.write_bytes(encode_png(pixels, compression))
+
+
+def encode_png(pixels: NDArray, compression: int = 1) -> bytes:
+    """The bytes of a PNG file of (H, W) 8- or 16-bit pixels, or (H, W, 3) 8-bit red, green, blue.
+
+    MemoryError if the encoder stopped: libpng has no other reason with pixels of these types.
+    """
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
+    stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
+    done, encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])
+    if not done or not (data := encoded.tobytes()).endswith(PNG_END):
+        raise MemoryError("a PNG encoder that stopped")
+    return data

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,8 +24,7 @@ MODELS = {
 }
 """COLMAP's camera models in the order of their numbers, and the parameters of each in the order of its files."""
 UNSUPPORTED = ("FOV", "THIN_PRISM_FISHEYE")
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""In the order of OpenCV."""
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of OpenCV
 FISHEYE = ("k1", "k2", "k3", "k4")
 
 
@@ -36,10 +34,8 @@ class Lens:
 
     width: int
     height: int
-    matrix: NDArray[np.float64]
-    """(3, 3) K, px; the left-most pixel is centered at 0.5."""
-    distortion: NDArray[np.float64]
-    """(8,) k1 k2 p1 p2 k3 k4 k5 k6 of OpenCV, or (4,) k1 k2 k3 k4 of a fisheye."""
+    matrix: NDArray[np.float64]  # (3, 3) K, px; the left-most pixel is centered at 0.5
+    distortion: NDArray[np.float64]  # (8,) k1 k2 p1 p2 k3 k4 k5 k6 of OpenCV, or (4,) k1 k2 k3 k4 of a fisheye
 
     @classmethod
     def of(cls, model: str, width: int, height: int, values: dict[str, float]) -> Lens:
@@ -77,7 +73,7 @@ class Undistorter:
         self.lens = lens
 
     @cached_property
-    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    def _maps(self) -> tuple[NDArray, NDArray] | None:
         """Column and row in the original of each pixel; None if the images stay as they are."""
         lens = self.lens
         if not lens.is_bent:
@@ -93,13 +89,8 @@ class Undistorter:
 
     def smooth(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W, 3) bicubic."""
-        return image if self._maps is None else cv2.remap(image, *self._maps, cv2.INTER_CUBIC)
+        return image if self._maps is None else np.asarray(cv2.remap(image, *self._maps, cv2.INTER_CUBIC), np.uint8)
 
     def nearest(self, image: NDArray) -> NDArray:
         """(H, W) nearest pixel, 0 outside of the original."""
         return image if self._maps is None else cv2.remap(image, *self._maps, cv2.INTER_NEAREST)
-
-
-def model_of(names: dict[str, float], model: str) -> str:
-    """COLMAP's name of the camera model of `transforms.json`, which may name none."""
-    return re.sub(r"[^A-Z_]", "", model.upper()) or ("OPENCV" if names.keys() & {*COEFFICIENTS} else "PINHOLE")

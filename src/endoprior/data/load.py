@@ -22,8 +22,7 @@ from .video_files import STILL_SUFFIXES, VIDEO_SUFFIXES, is_video
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
 CALIBRATIONS = (".ini", ".yaml", ".yml", ".npz")
 RUN_FILES = ("scene.safetensors", "checkpoint.safetensors", "log.jsonl")
-WINDOWS = "windows"
-"""Folder of a run in windows, which has none of these files before its last window is trained."""
+WINDOWS = "windows"  # folder of a run in windows, which has none of these files before its last window is trained
 SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
 """The word of a name that tells the left camera from the right one."""
 
@@ -58,40 +57,30 @@ def load_sequence(
     else:
         raise ValueError(f"pose_axes must be opencv for the {name} layout, which defines it; got {pose_axes!r}")
     # Which frames are used and held out is decided here, so that readers of other packages cannot differ.
-    sequence = _window_of(sequence.with_test_phase(cfg.test_phase), cfg.window)
+    sequence = sequence.with_test_phase(cfg.test_phase)
+    if cfg.window:
+        frames = sorted(read_ranges("data.window", cfg.window))
+        if len(frames) < 2 or frames[-1] >= len(sequence) or frames[-1] - frames[0] != len(frames) - 1:
+            expected = f"two frames within 0 to {len(sequence) - 1}, such as 0-{len(sequence) // 2}"
+            raise input_error("data.window", expected, cfg.window, "correct it, or leave it out for all frames.")
+        sequence = sequence.part(frames[0], frames[-1] + 1)
     sequence.reading = cfg
     return sequence
 
 
-def _window_of(sequence: FrameSequence, window: str) -> FrameSequence:
-    """The frames of `sequence` that `DataConfig.window` names; all of them if it names none."""
-    if not window:
-        return sequence
-    frames = sorted(read_ranges("data.window", window))
-    if len(frames) > 1 and frames[-1] < len(sequence) and frames[-1] - frames[0] == len(frames) - 1:
-        return sequence.part(frames[0], frames[-1] + 1)
-    expected = f"two frames within 0 to {len(sequence) - 1}, such as 0-{len(sequence) // 2}"
-    raise input_error("data.window", expected, window, "correct it, or leave it out for all frames.")
-
-
 def find_format(path: Path, cfg: DataConfig) -> str:
-    """The name of a layout that `cfg.format` gives; for `auto` the first layout that recognizes the folder.
-
-    Raises:
-        InputError: there is no layout of that name, or none recognizes the folder.
-    """
+    """The name of a layout that `cfg.format` gives; for `auto` the first layout that recognizes the folder."""
+    known = ", ".join(REGISTRY.names())
     if cfg.format != "auto":
         if cfg.format in REGISTRY.names():
             return cfg.format
-        choices = f"auto, {', '.join(REGISTRY.names())}"
-        raise input_error("data.format", f"one of {choices}", repr(cfg.format), "see docs/datasets.md.")
+        raise input_error("data.format", f"one of auto, {known}", repr(cfg.format), "see docs/datasets.md.")
     if name := recognizing(path):
         return name
     if error := not_a_sequence(path):
         raise error
     names = sorted(entry.name + "/" * entry.is_dir() for entry in entries(path) if not entry.name.startswith("."))
     got = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    known = ", ".join(REGISTRY.names())
     raise input_error(path, f"one of the layouts {known}", got or "an empty folder", "see docs/datasets.md.")
 
 
@@ -109,44 +98,35 @@ def is_run(folder: Path) -> bool:
 
 
 def not_a_sequence(path: Path) -> InputError | None:
-    """The error for a path that is no sequence folder but can be used otherwise; None if nothing is recognized.
-
-    Raises:
-        InputError: the path cannot be read.
-    """
+    """The error for a path that is no sequence folder but can be used otherwise; None if nothing is recognized."""
     kind = kind_of(path)
-    if kind == "a file":
-        found = _file(path)
-    else:
-        found = _folder(path) if kind == "a folder" else None
-    return found and input_error(path, "a sequence folder", *found)
+    found = None
+    if kind == "a folder":
+        found = _folder(path)
+    elif kind == "a file" and path.suffix.lower() in ARCHIVES:
+        found = "an archive", "unpack it and pass the folder."
+    elif kind == "a file" and path.name in RUN_FILES:
+        found = "a file of a run", f"`{command('view', path.parent)}`, or pass the sequence folder of the run."
+    elif kind == "a file" and is_video(path):
+        found = "a video", f"{_prepare(path)}."
+    return input_error(path, "a sequence folder", *found) if found else None
 
 
 def not_a_run(path: Path) -> InputError | None:
     """The error for a path that is no run folder but holds one or leads to one; None for others."""
     kind = kind_of(path)
+    what = fix = ""
     if kind == "nothing":
-        got, fix = f"no such {'file' if path.name == RUN_FILES[0] else 'folder'}", "Correct the path, or make a run: "
-        return input_error(path, "a run folder", got, f"{fix}`{command('train', 'DATA', path)}`.")
-    if kind == "a folder" and is_sequence(path):
-        fix = f"`{command('train', path, 'RUN')}`, then pass RUN."
-        return input_error(path, "a run folder", "a sequence folder", fix)
-    if kind == "a folder" and is_run(path / "run"):
-        return input_error(path, "a run folder", "a folder with a run in it", f"pass {quoted(path / 'run')}.")
-    if (kind == "a file" and is_video(path)) or (kind == "a folder" and not is_run(path) and _has_images(path)):
+        what = f"no such {'file' if path.name == RUN_FILES[0] else 'folder'}"
+        fix = f"Correct the path, or make a run: `{command('train', 'DATA', path)}`."
+    elif kind == "a folder" and is_sequence(path):
+        what, fix = "a sequence folder", f"`{command('train', path, 'RUN')}`, then pass RUN."
+    elif kind == "a folder" and is_run(path / "run"):
+        what, fix = "a folder with a run in it", f"pass {quoted(path / 'run')}."
+    elif (kind == "a file" and is_video(path)) or (kind == "a folder" and not is_run(path) and _has_images(path)):
         what, out = "a video" if kind == "a file" else "a folder of images", _beside(path, "out")
         fix = f"`{command('run', path, out)}`, then pass {quoted(out / 'run')}."
-        return input_error(path, "a run folder", what, fix)
-    return None
-
-
-def _file(path: Path) -> tuple[str, str] | None:
-    """What a file is, and the fix; None if it is not recognized."""
-    if path.suffix.lower() in ARCHIVES:
-        return "an archive", "unpack it and pass the folder."
-    if path.name in RUN_FILES:
-        return "a file of a run", f"`{command('view', path.parent)}`, or pass the sequence folder of the run."
-    return ("a video", f"{_prepare(path)}.") if is_video(path) else None
+    return input_error(path, "a run folder", what, fix) if what else None
 
 
 def _folder(path: Path) -> tuple[str, str] | None:
@@ -159,20 +139,22 @@ def _folder(path: Path) -> tuple[str, str] | None:
     inside = sorted(entry for entry in entries(path) if not entry.name.startswith("."))
     folders = [entry for entry in inside if entry.is_dir()]
     sequences = [folder for folder in folders if is_sequence(folder)]
-    if len(sequences) == 1 and is_run(path / "run"):
-        fix = f"pass {quoted(sequences[0])}; the run is {quoted(path / 'run')}."
-        return "a folder with a sequence and a run in it", fix
     if len(sequences) == 1:
-        return "a folder with one sequence folder in it", f"pass {quoted(sequences[0])}."
+        fix = f"pass {quoted(sequences[0])}"
+        if is_run(path / "run"):
+            return "a folder with a sequence and a run in it", f"{fix}; the run is {quoted(path / 'run')}."
+        return "a folder with one sequence folder in it", f"{fix}."
     videos = [entry for entry in inside if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
     if len(videos) == 1:
         return "a folder with a video", f"{_prepare(videos[0])}."
-    for what, pair in (("videos", _pair(videos)), ("image folders", _pair([f for f in folders if _has_images(f)]))):
-        if pair:
-            return f"{what} of two cameras", f"{_prepare_pair(*pair, inside)}."
-    if not sequences and _has_images(path):
-        return "a folder of images", f"{_prepare(path)}."
-    return None
+    for what, paths in (("videos", videos), ("image folders", [each for each in folders if _has_images(each)])):
+        if pair := _pair(paths):
+            files = [entry for entry in inside if entry.suffix.lower() in CALIBRATIONS]
+            files += [entry for entry in inside if entry.suffix == ".json" and "calib" in entry.name.lower()]
+            calibration = files[0] if len(files) == 1 else "FILE"
+            fix = _prepare(pair[0], "--right", pair[1], "--calibration", calibration)
+            return f"{what} of two cameras", f"{fix}."
+    return ("a folder of images", f"{_prepare(path)}.") if not sequences and _has_images(path) else None
 
 
 def _fix_of_run(path: Path) -> str:
@@ -199,22 +181,12 @@ def _beside(path: Path, ending: str) -> Path:
     return whole.with_name(f"{whole.stem if whole.is_file() else whole.name}_{ending}")
 
 
-def _prepare_pair(left: Path, right: Path, inside: Sequence[Path]) -> str:
-    files = [entry for entry in inside if entry.suffix.lower() in CALIBRATIONS]
-    files += [entry for entry in inside if entry.suffix == ".json" and "calib" in entry.name.lower()]
-    return _prepare(left, "--right", right, "--calibration", files[0] if len(files) == 1 else "FILE")
-
-
 def _pair(paths: Sequence[Path]) -> tuple[Path, Path] | None:
     """(left, right) if there are two paths whose names differ in that word only."""
-    sides = {}
-    for path in paths:
-        if (words := SIDE.findall(path.stem)) and len(words) == 1:
-            sides[words[0][0].lower()] = path
-    if len(paths) != 2 or set(sides) != {"l", "r"}:
+    sides = {words[0][0].lower(): path for path in paths if len(words := SIDE.findall(path.stem)) == 1}
+    if len(paths) != 2 or set(sides) != {"l", "r"} or len({SIDE.sub("", path.stem) for path in paths}) != 1:
         return None
-    rest = {SIDE.sub("", path.stem) for path in paths}
-    return (sides["l"], sides["r"]) if len(rest) == 1 else None
+    return sides["l"], sides["r"]
 
 
 def _has_images(folder: Path) -> bool:

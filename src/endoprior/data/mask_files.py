@@ -6,10 +6,10 @@ a single file, where 0, 1 and 255 may be a tool with a rim to ignore.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -17,44 +17,35 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..footage.polarity import Polarity, mask_polarity
-from .images import decode_image
+from .images import Size, decode_image
 from .reading import read_only_array
 
-JPEG_ERROR = 32
-"""Largest compression error next to an outline, in levels 0..255."""
-FLAT_ERROR = 2
-"""Largest compression error inside of a region."""
-MOST_LABELS = 32
-"""With more values, those near the lowest and the highest one are compression errors."""
-MOST_AREA = 0.5
-"""Labels that cover a larger share of the images may be tissue as well."""
-LEAST_SHARE = 0.05
-"""Values between that are a smaller share of such an area are errors, not labels."""
+JPEG_ERROR = 32  # largest compression error next to an outline, in levels 0..255
+FLAT_ERROR = 2  # largest compression error inside of a region
+MOST_LABELS = 32  # with more values, those near the lowest and the highest one are compression errors
+MOST_AREA = 0.5  # labels that cover a larger share of the images may be tissue as well
+LEAST_SHARE = 0.05  # values between that are a smaller share of such an area are errors, not labels
 COLOR = 1 << 56
 """Colors are numbers from here on, with 16 bits for each of red, green and blue; black and grays are their level."""
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
 LOSSY = (".jpg", ".jpeg", ".webp")
-MOST_LABEL_COLORS = 256
-"""A file with more colors is a photo, not a mask."""
-LEAST_CERTAINTY = 0.5
-"""If the detected polarity is less certain, high values mark tools by convention."""
-LABELS = "--mask-labels"
+MOST_LABEL_COLORS = 256  # a file with more colors is a photo, not a mask
+LEAST_CERTAINTY = 0.5  # if the detected polarity is less certain, high values mark tools by convention
+OPTION = "--mask-labels"
+Mask = NDArray[np.bool_]
+Label = TypeVar("Label")
 
 
 @dataclass(frozen=True)
 class HighValues:
     """Which values are high."""
 
-    above: float
-    """Larger values are ..."""
-    chosen: tuple[int, ...] = ()
-    """... unless the user has chosen these."""
-    labels: tuple[int, ...] = ()
-    """The values that occur, where they are labels; empty where they are two, smoothed, or fractions."""
-    doubt: str = ""
-    """Why it is not known which labels are tools; empty where it is."""
+    above: float  # larger values are ...
+    chosen: tuple[int, ...] = ()  # ... unless the user has chosen these
+    labels: tuple[int, ...] = ()  # the values that occur, unless they are two, smoothed, or fractions
+    doubt: str = ""  # why it is not known which labels are tools; empty where it is
 
-    def of(self, values: NDArray) -> NDArray[np.bool_]:
+    def of(self, values: NDArray) -> Mask:
         """(H, W) True where numbers (H, W) are high."""
         return np.isin(values, self.chosen) if self.chosen else values > self.above
 
@@ -70,22 +61,18 @@ class HighValues:
 class Tally:
     """The values of the files of a folder."""
 
-    pixels: dict[int, int] = field(default_factory=dict)
-    """How often each whole number occurs."""
+    pixels: dict[int, int] = field(default_factory=dict)  # how often each whole number occurs
     slopes: dict[int, int] = field(default_factory=dict)
     """How often a pixel of that number has both a smaller and a larger neighbor, as on a smoothed outline."""
-    fractions: bool = False
-    """Whether other numbers occur."""
+    fractions: bool = False  # whether other numbers occur
     lowest: float = np.inf
-    highest: float = -np.inf
-    lossy: bool = False
-    """Whether a file is compressed with errors."""
+    lossy: bool = False  # whether a file is compressed with errors
 
     def add(self, values: NDArray, lossy: bool) -> None:
         """Count the numbers (H, W) of a file, bool or finite."""
         self.lossy |= lossy
         if values.size:
-            self.lowest, self.highest = min(self.lowest, values.min()), max(self.highest, values.max())
+            self.lowest = min(self.lowest, float(values.min()))
         if values.dtype.kind == "f":
             if (values != np.round(values)).any():
                 self.fractions = True
@@ -150,6 +137,23 @@ def names(numbers: Iterable[int], most: int = 12) -> str:
     return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
 
 
+def asked_labels(subject: Path, asked: str, labels: Mapping[str, Label], known: str, example: str) -> list[Label]:
+    """The labels that the user names, separated by commas, without regard to case and leading zeros: 001 is 1.
+
+    `subject`, `known` and `example` are the place of the labels, all of them, and one of them, for messages.
+    """
+
+    def plain(text: str) -> str:
+        return text.strip().casefold().lstrip("0") or "0"
+
+    by_name = {plain(label): value for label, value in labels.items()}
+    wanted = [text.strip() for text in asked.split(",") if text.strip()] or ["nothing"]
+    for text in wanted:
+        if plain(text) not in by_name:
+            raise input_error(OPTION, f"labels of {subject} ({known})", text, f"`{OPTION} {example}`.")
+    return [by_name[plain(text)] for text in wanted]
+
+
 def _counts(values: NDArray) -> Iterable[tuple[int, int]]:
     if values.dtype.kind in "bu" and values.dtype.itemsize <= 2:
         counts = np.bincount(values.ravel())
@@ -157,7 +161,7 @@ def _counts(values: NDArray) -> Iterable[tuple[int, int]]:
     return [(int(number), int(count)) for number, count in zip(*np.unique(values, return_counts=True), strict=True)]
 
 
-def _on_slope(values: NDArray, error: int) -> NDArray[np.bool_]:
+def _on_slope(values: NDArray, error: int) -> Mask:
     """(H, W) True where one of the 8 neighbors is smaller and one larger, each by more than `error`."""
     if not values.size:
         return np.zeros(values.shape, bool)
@@ -167,8 +171,8 @@ def _on_slope(values: NDArray, error: int) -> NDArray[np.bool_]:
     return (low + error < numbers) & (numbers + error < high)
 
 
-def read_user_mask(path: Path, size: tuple[int, int], rule: HighValues | None = None) -> NDArray[np.bool_]:
-    """Read a mask in any usual format.
+def read_user_mask(path: Path, size: Size, rule: HighValues | None = None) -> Mask:
+    """Read a mask in any usual format: (H, W) True where the value is high. `tool_polarity` tells if that is a tool.
 
     Images: 0 and 255, 0 and 1, smoothed or compressed gray (above half is high), label images (above 0 is high), colors
     on black (not black is high), an alpha channel that is not the same everywhere (more than half opaque is high).
@@ -176,27 +180,26 @@ def read_user_mask(path: Path, size: tuple[int, int], rule: HighValues | None = 
     [0, 1] (above 0.5 is high), logits (some below 0; above 0 is high).
 
     Args:
-        path: the file.
         size: (width, height) of the frames, px.
         rule: which values of its folder are high, from `rule_of_files`; None decides by this file alone.
-    Returns:
-        (H, W) True where the value is high. `tool_polarity` tells whether high values mark tools.
     """
     rule = rule or rule_of_files([path])
     high = rule.of(_numbers(path))
-    if high.shape != size[::-1]:
-        got = f"{high.shape[1]}x{high.shape[0]}"
-        hint = "Export masks at the size of the images."
-        raise input_error(path, f"{size[0]}x{size[1]} px like the images", got, hint)
+    demand_size(path, (high.shape[1], high.shape[0]), size)
     return high
 
 
-def rule_of_files(files: Sequence[Path], asked: str = "") -> HighValues:
-    """Which values are high in the masks of a folder. All files are decoded.
+def demand_size(subject: Path | str, got: Size, size: Size) -> None:
+    """Raise InputError unless a mask has the size of the frames."""
+    if got != size:
+        want = f"{size[0]}x{size[1]} px like the images"
+        raise input_error(subject, want, f"{got[0]}x{got[1]}", "Export masks at the size of the images.")
 
-    Args:
-        files: of one clip; a label that occurs in a single frame counts.
-        asked: labels that are high, separated by commas: numbers, or colors such as `#ff5500`; empty for all above 0.
+
+def rule_of_files(files: Sequence[Path], asked: str = "") -> HighValues:
+    """Which values are high in the masks of a clip. All are decoded: a label that occurs in a single frame counts.
+
+    `asked` names labels that are high, separated by commas: numbers, or colors such as `#ff5500`; empty: all above 0.
     """
     tally, odd = Tally(), None
     for file in files:
@@ -207,8 +210,14 @@ def rule_of_files(files: Sequence[Path], asked: str = "") -> HighValues:
     if odd and tally.lowest >= 0:
         got = f"values up to {odd[1].max():g}"
         raise input_error(odd[0], "labels, probabilities in [0, 1] or logits", got, "Save a bool array.")
-    rule = high_values(tally)
-    return _chosen(tally, asked, files[0].parent) if asked else rule
+    if not asked:
+        return high_values(tally)
+    folder, known = files[0].parent, sorted(tally.pixels)
+    if tally.lossy or tally.fractions:
+        kind = "compressed with errors" if tally.lossy else "fractions"
+        raise input_error(OPTION, f"labels in {folder}", f"values that are {kind}", f"Remove {OPTION}.")
+    chosen = asked_labels(folder, asked, {name(number): number for number in known}, names(known), name(known[-1]))
+    return HighValues(0, chosen=tuple(chosen), labels=tuple(known))
 
 
 def demand_known(folder: Path, rule: HighValues, fix: str) -> None:
@@ -218,20 +227,11 @@ def demand_known(folder: Path, rule: HighValues, fix: str) -> None:
 
 
 def tool_polarity(
-    tool_value: Literal["auto", "high", "low"],
-    highs: Sequence[NDArray[np.bool_]],
-    images: Sequence[NDArray[np.uint8]],
+    tool_value: Literal["auto", "high", "low"], highs: Sequence[Mask], images: Sequence[NDArray[np.uint8]]
 ) -> Polarity:
     """Which value marks tools: the given one, else the detected one, else high values by convention.
 
-    Args:
-        tool_value: `high`, `low`, or `auto` to detect it.
-        highs: (H, W) each, from `read_user_mask`.
-        images: (H, W, 3) each, 0..255, the frames of these masks; a dozen are enough.
-    Returns:
-        The polarity; its `reason` is a line to show to the user.
-    Raises:
-        ValueError: as `footage.polarity.mask_polarity`.
+    `highs` are of `read_user_mask`, `images` the frames of these masks; a dozen are enough. The `reason` is for users.
     """
     if tool_value != "auto":
         return Polarity(tool_value == "high", 1.0, f"{tool_value} values mark tools (--mask-tool-value)")
@@ -243,46 +243,21 @@ def tool_polarity(
     return replace(detected, reason=f"{value} values mark tools: {detected.reason}")
 
 
-def _chosen(tally: Tally, asked: str, folder: Path) -> HighValues:
-    """The labels that the user names; InputError if one does not occur or the files have no labels."""
-    known = sorted(tally.pixels)
-    if tally.lossy or tally.fractions:
-        kind = "compressed with errors" if tally.lossy else "fractions"
-        raise input_error(LABELS, f"labels in {folder}", f"values that are {kind}", f"Remove {LABELS}.")
-    by_name = {name(number): number for number in known}
-    wanted = []
-    for text in (part.strip().lower() for part in asked.split(",")):
-        plain = text if text.startswith("#") else text.lstrip("0") or "0"
-        if plain not in by_name:
-            fix = f"`{LABELS} {name(known[-1])}`."
-            raise input_error(LABELS, f"labels of {folder} ({names(known)})", text or "nothing", fix)
-        wanted.append(by_name[plain])
-    return HighValues(0, chosen=tuple(wanted), labels=tuple(known))
-
-
 def _numbers(path: Path) -> NDArray:
     """(H, W) bool or finite numbers of a file; a color is a number from `COLOR` on, and black is 0."""
-    if path.suffix.lower() in (".npy", ".npz"):
-        return _load_array(path)
-    pixels = decode_image(path, None)
-    return _of_colors(path, pixels) if pixels.ndim == 3 else _finite(path, pixels)
-
-
-def _load_array(path: Path) -> NDArray:
-    """(H, W) numbers; the union of a stack of bool masks."""
     hint = "Save one array of shape (height, width)."
-    loaded = read_only_array(path, hint)
-    values = np.squeeze(loaded)
-    if values.dtype == bool and values.ndim == 3:
-        values = values.any(0)
-    if values.ndim != 2 or values.dtype.kind not in "buif":
-        raise input_error(path, "numbers of shape (height, width)", f"{loaded.dtype} of {loaded.shape}", hint)
-    return _finite(path, values)
-
-
-def _finite(path: Path, values: NDArray) -> NDArray:
-    wrong = int((~np.isfinite(values)).sum()) if values.dtype.kind == "f" else 0
-    if wrong:
+    if path.suffix.lower() in (".npy", ".npz"):
+        loaded = read_only_array(path, hint)
+        values = np.squeeze(loaded)
+        if values.dtype == bool and values.ndim == 3:
+            values = values.any(0)
+        if values.ndim != 2 or values.dtype.kind not in "buif":
+            raise input_error(path, "numbers of shape (height, width)", f"{loaded.dtype} of {loaded.shape}", hint)
+    else:
+        values = decode_image(path, None)
+        if values.ndim == 3:
+            return _of_colors(path, values)
+    if wrong := int((~np.isfinite(values)).sum()) if values.dtype.kind == "f" else 0:
         raise input_error(path, "finite numbers", f"{wrong} NaN or infinite ones", "Replace them before saving.")
     return values
 

@@ -6,6 +6,7 @@ docs.nerf.studio describes it under "data conventions".
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,10 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from .colmap import present
-from .files import in_order, read_json, read_matrix
+from .files import read_json, read_matrix
 from .formats import Format
 from .images import read_color
-from .lens import COEFFICIENTS, Lens, model_of
+from .lens import COEFFICIENTS, Lens
 from .posed_images import PosedImage, load_posed
 from .sequence import FrameSequence
 
@@ -27,11 +27,9 @@ UNDISTORT = "undistort the images and write fl_x, fl_y, cx, cy of a PINHOLE came
 OTHER_POWERS = ("k4", "k5", "k6")
 """Coefficients that mean another thing in nerfstudio than in OpenCV, unless the lens is a fisheye."""
 FIX = "write it as docs.nerf.studio describes."
-NAMES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "camera_angle_x": "angle"} | {k: k for k in COEFFICIENTS}
-"""Keys of the lens, in the whole file or in a frame, and our names."""
-TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenGL camera axes (x right, y up, z backward) to OpenCV's."""
-MM_PER_M = 1000.0
+NAMES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "camera_angle_x": "angle", "w": "w", "h": "h"}
+NAMES |= {name: name for name in COEFFICIENTS}  # keys of the lens, in the whole file or in a frame, and our names
+TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL camera axes (x right, y up, z backward)
 
 
 def is_nerfstudio(path: Path) -> bool:
@@ -41,23 +39,12 @@ def is_nerfstudio(path: Path) -> bool:
 
 
 def load_nerfstudio(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open the images that the file names, by their times if it has them, else in the order of their names."""
+    """Open the images that the file names."""
     file = path / FILE
     stored, frames = _frames(file)
     lenses: dict[str, Lens] = {}
-    posed = [(_posed(path, file, stored, frame, index, lenses), frame) for index, frame in enumerate(frames)]
-    times = [frame.get("time") for frame in frames]
-    if all(isinstance(time, int | float) for time in times) and len({*times}) == len(times):
-        posed.sort(key=lambda each: each[1]["time"])
-    else:
-        rank = {file: i for i, file in enumerate(in_order(each.file for each, _ in posed))}
-        posed.sort(key=lambda each: rank[each[0].file])
-    remarks: list[str] = []
-    images = present(file, [each for each, _ in posed], remarks)
-    has_depth = any(each.depth for each in images)
-    if has_depth:
-        remarks.append(f"{file}: depth in mm and poses in m, as nerfstudio has them")
-    return load_posed(path, cfg, file, images, [file], remarks, MM_PER_M if has_depth else None)
+    posed = [_posed(path, file, stored, frame, index, lenses) for index, frame in enumerate(frames)]
+    return load_posed(path, cfg, file, posed, [file], [])
 
 
 def read_poses(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
@@ -94,57 +81,53 @@ def _to_world(file: Path, frame: dict[str, Any]) -> NDArray[np.float64]:
 def _posed(
     path: Path, file: Path, stored: dict[str, Any], frame: dict[str, Any], index: int, lenses: dict[str, Lens]
 ) -> PosedImage:
-    image = _below(path, file, _name(file, frame, index))
+    """One image; `lenses` keeps the same object for the same numbers."""
+
+    def below(name: str) -> Path:
+        if not (path / name).is_relative_to(path):
+            raise input_error(file, "paths from its folder", name[:80], "write paths relative to the file.")
+        return path / name
+
+    image = below(_name(file, frame, index))
     if not image.suffix:  # as in Blender's data
         image = image.with_name(f"{image.name}.png")
-    mask, depth = (frame.get(key) for key in ("mask_path", "depth_file_path"))
-    return PosedImage(
-        image,
-        _lens(file, image, stored | frame, index, lenses),
-        np.linalg.inv(_to_world(file, frame)),
-        _below(path, file, mask) if isinstance(mask, str) else None,
-        _below(path, file, depth) if isinstance(depth, str) else None,
-    )
-
-
-def _below(path: Path, file: Path, name: str) -> Path:
-    """A file that `transforms.json` names."""
-    if not (path / name).is_relative_to(path):
-        raise input_error(file, "paths from its folder", name[:80], "write paths relative to the file.")
-    return path / name
-
-
-def _lens(file: Path, image: Path, stored: dict[str, Any], index: int, lenses: dict[str, Lens]) -> Lens:
-    """The lens of a frame, the same object for the same numbers."""
-    values = {}
-    for key in (*NAMES, "w", "h"):
-        value = stored.get(key)
-        if value is not None and (
-            isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value)
-        ):
-            raise input_error(file, f"{key} to be a number", repr(value)[:60], FIX)
-        if value is not None:
-            values[NAMES.get(key, key)] = float(value)
-    if not {"w", "h"} <= values.keys():
-        values["h"], values["w"] = (float(side) for side in read_color(image).shape[:2])
-    width, angle = values["w"], values.pop("angle", 0.0)
-    if "fx" not in values and 0 < angle < math.pi:
-        values["fx"] = width / 2 / math.tan(angle / 2)
-    model = str(stored.get("camera_model") or "")
-    if stored.get("is_fisheye"):
-        model = "OPENCV_FISHEYE"
-    if model == "PERSPECTIVE":
-        model = "OPENCV"
-    if not model.endswith("FISHEYE") and (more := [name for name in OTHER_POWERS if values.get(name)]):
-        raise input_error(file, "k1, k2, k3, p1, p2", f"{more[0]} of another polynomial than OpenCV's", UNDISTORT)
+    named = [frame.get(key) for key in ("mask_path", "depth_file_path")]
+    mask, depth = (below(name) if isinstance(name, str) else None for name in named)
+    values, model = _parameters(file, image, stored | frame)
     key = repr((model, sorted(values.items())))
     if key not in lenses:
         try:
-            lenses[key] = Lens.of(model_of(values, model), int(width), int(values["h"]), values)
+            lenses[key] = Lens.of(model, int(values["w"]), int(values["h"]), values)
         except ValueError as error:
             want = "fl_x and a PINHOLE, OPENCV or OPENCV_FISHEYE camera"
             raise input_error(file, want, f"{error} in frame {index}", UNDISTORT) from None
-    return lenses[key]
+    time = frame.get("time")
+    time = time if isinstance(time, int | float) else None
+    to_camera = np.linalg.inv(_to_world(file, frame)).astype(np.float64)
+    return PosedImage(image, lenses[key], to_camera, mask, depth, time)
+
+
+def _parameters(file: Path, image: Path, stored: dict[str, Any]) -> tuple[dict[str, float], str]:
+    """The numbers of a lens, and COLMAP's name of the camera model, which the file may not give."""
+    values: dict[str, float] = {}
+    for key, ours in NAMES.items():
+        value = stored.get(key)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise input_error(file, f"{key} to be a number", repr(value)[:60], FIX)
+        values[ours] = float(value)
+    if not {"w", "h"} <= values.keys():
+        values["h"], values["w"] = (float(side) for side in read_color(image).shape[:2])
+    angle = values.pop("angle", 0.0)
+    if "fx" not in values and 0 < angle < math.pi:
+        values["fx"] = values["w"] / 2 / math.tan(angle / 2)
+    model = "OPENCV_FISHEYE" if stored.get("is_fisheye") else str(stored.get("camera_model") or "")
+    model = {"PERSPECTIVE": "OPENCV"}.get(model, model)
+    if not model.endswith("FISHEYE") and (more := [name for name in OTHER_POWERS if values.get(name)]):
+        raise input_error(file, "k1, k2, k3, p1, p2", f"{more[0]} of another polynomial than OpenCV's", UNDISTORT)
+    model = re.sub(r"[^A-Z_]", "", model.upper())
+    return values, model or ("OPENCV" if values.keys() & {*COEFFICIENTS} else "PINHOLE")
 
 
 FORMAT = Format(is_nerfstudio, load_nerfstudio)

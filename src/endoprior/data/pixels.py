@@ -11,16 +11,11 @@ from numpy.typing import NDArray
 from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 
-GAP = 1.5
-"""A number is a filling if it is larger than all others by this factor ..."""
-FEWEST = 8
-"""... and occurs in at least so many pixels, which measured depth at such a distance does not."""
-FARTHEST = 20.0
-"""Depth beyond so many times the median of an image is an error of measurement."""
-CLIP_PERCENTILES = (3.0, 99.8)
-"""Measured depths of a frame are clipped to these percentiles of themselves."""
-LEAST_PIXELS = 100
-"""The median of fewer says nothing."""
+GAP = 1.5  # a number is a filling if it is larger than all others by this factor ...
+FEWEST = 8  # ... and occurs in at least so many pixels, which measured depth at such a distance does not
+FARTHEST = 20.0  # depth beyond so many times the median of an image is an error of measurement
+CLIP_PERCENTILES = (3.0, 99.8)  # measured depths of a frame are clipped to these percentiles of themselves
+LEAST_PIXELS = 100  # the median of fewer says nothing
 
 
 def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]:
@@ -41,8 +36,7 @@ def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]
         values = stored[measured]
         largest = values.max()
         is_largest = values == largest
-        count = int(is_largest.sum())
-        if FEWEST <= count < values.size and largest > GAP * float(values[~is_largest].max()):
+        if FEWEST <= is_largest.sum() < values.size and largest > GAP * float(values[~is_largest].max()):
             measured &= stored != largest
             continue
         if values.size < LEAST_PIXELS or largest <= FARTHEST * float(values.min()):  # then none is beyond
@@ -75,32 +69,22 @@ def clean_depth(
     return depth, np.ones_like(valid) if cfg.lift_missing_depth else valid
 
 
-def _steps(width: int, height: int, factor: int) -> tuple[int, int]:
-    """Columns and rows of the blocks that become one pixel: `factor`, or the whole side if it is shorter."""
-    return min(factor, width), min(factor, height)
-
-
 def shrunk_camera(camera: Camera, factor: int) -> Camera:
     """The camera of images that are `factor` times smaller: sizes rounded down, at least 1 px."""
-    across, down = _steps(camera.width, camera.height, factor)
-    return replace(
-        camera,
-        width=camera.width // across,
-        height=camera.height // down,
-        fx=camera.fx / across,
-        fy=camera.fy / down,
-        cx=camera.cx / across,
-        cy=camera.cy / down,
-    )
+    across, down = min(factor, camera.width), min(factor, camera.height)
+    width, height = camera.width // across, camera.height // down
+    lens = {"fx": camera.fx / across, "fy": camera.fy / down, "cx": camera.cx / across, "cy": camera.cy / down}
+    return replace(camera, width=width, height=height, **lens)
 
 
 def shrunk_color(rgb_u8: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """(H, W, 3) color at 1 / `factor` of its size, as `shrunk` has it: each pixel is the mean of its block."""
     if factor == 1:
         return rgb_u8
-    across, down = _steps(rgb_u8.shape[1], rgb_u8.shape[0], factor)
-    width, height = rgb_u8.shape[1] // across, rgb_u8.shape[0] // down
-    return cv2.resize(rgb_u8[: down * height, : across * width], (width, height), interpolation=cv2.INTER_AREA)
+    blocks = _blocks(rgb_u8[..., 0], factor)
+    height, down, width, across = blocks.shape
+    whole = rgb_u8[: down * height, : across * width]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def shrunk(frame: Frame, factor: int) -> Frame:
@@ -110,21 +94,21 @@ def shrunk(frame: Frame, factor: int) -> Frame:
     """
     if factor == 1:
         return frame
-    camera = shrunk_camera(frame.camera, factor)
-    steps, width, height = _steps(frame.camera.width, frame.camera.height, factor), camera.width, camera.height
     with np.errstate(over="ignore"):  # a mean beyond float32 counts as missing
-        depth = _blocks(frame.depth, width, height, steps).mean((1, 3), dtype=np.float32)
-    valid = _blocks(frame.depth_valid, width, height, steps).all((1, 3)) & np.isfinite(depth)
+        depth = _blocks(frame.depth, factor).mean((1, 3), dtype=np.float32)
+    valid = _blocks(frame.depth_valid, factor).all((1, 3)) & np.isfinite(depth)
     return replace(
         frame,
-        camera=camera,
+        camera=shrunk_camera(frame.camera, factor),
         rgb_u8=shrunk_color(frame.rgb_u8, factor),
-        tissue_mask=_blocks(frame.tissue_mask, width, height, steps).all((1, 3)),
+        tissue_mask=_blocks(frame.tissue_mask, factor).all((1, 3)),
         depth=np.where(valid, depth, np.float32(0)),
         depth_valid=valid,
     )
 
 
-def _blocks(image: NDArray, width: int, height: int, steps: tuple[int, int]) -> NDArray:
-    across, down = steps
+def _blocks(image: NDArray, factor: int) -> NDArray:
+    """(height, down, width, across) view of the blocks of (H, W) that become one pixel, whole ones only."""
+    down, across = (min(factor, side) for side in image.shape)
+    height, width = image.shape[0] // down, image.shape[1] // across
     return image[: down * height, : across * width].reshape(height, down, width, across)

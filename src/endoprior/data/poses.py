@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from .files import read_table
+from .images import Size
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I of a valid rotation: far above float32 rounding, far below a real scale."""
 MATRIX_FILE = "intrinsics.txt"
-OFF_CENTER = 0.2
-"""Largest distance of the principal point from the image center, as a share of the image's sides."""
-SAME_SHAPE = 0.01
-"""Largest relative difference of the scales along both sides."""
+OFF_CENTER = 0.2  # largest distance of the principal point from the image center, as a share of the image's sides
+SAME_SHAPE = 0.01  # largest relative difference of the scales along both sides
+ROUNDED_PX = 1.0  # scaled images may differ from the exact shape by rounding
 
 
 def demand_rotations(path: Path, rotations: NDArray[np.float64], where: str, fix: str) -> None:
@@ -40,6 +40,22 @@ def identity_poses(count: int) -> list[NDArray[np.float64]]:
     return [np.eye(4) for _ in range(count)]
 
 
+def scale_of(path: Path, stated: tuple[float, float], size: Size, focal: float, fix: str, remarks: list[str]) -> float:
+    """Factor by which numbers in a file for images of the `stated` size fit those of `size`, both (width, height), px.
+
+    Files often hold the size of the original video beside smaller images; a remark tells what `focal`, px, becomes.
+    """
+    if stated == size:
+        return 1.0
+    got, want, scale = f"{stated[0]:g}x{stated[1]:g}", f"{size[0]}x{size[1]}", size[0] / max(stated[0], 1e-9)
+    if stated[0] <= 0 or abs(scale * stated[1] - size[1]) > ROUNDED_PX:
+        raise input_error(path, f"the size of the images, {want} px, or that shape", got, fix)
+    remarks.append(
+        f"{path}: its focal length, {focal:g} px, is for {got} px; scaled to {focal * scale:g} px for {want}"
+    )
+    return scale
+
+
 def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     """(3, 3) camera matrix, px, of a text file with 3x3, 3x4 or 4x4 numbers.
 
@@ -56,7 +72,7 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
 
 
 def matrix_of_images(
-    path: Path, matrix: NDArray[np.float64], size: tuple[int, int], usual: tuple[int, int], remarks: list[str]
+    path: Path, matrix: NDArray[np.float64], size: Size, usual: Size, remarks: list[str]
 ) -> NDArray[np.float64]:
     """The matrix in px of images of this (width, height): as it is, or scaled from images of the `usual` size.
 
@@ -70,13 +86,10 @@ def matrix_of_images(
         fix = "scale fx, fy, cx, cy to the size of the images."
         raise input_error(path, f"a principal point near the center of {size[0]}x{size[1]} px", got, fix)
     scaled = np.diag([across, down, 1.0]) @ matrix
-    remarks.append(
-        f"{path}: its principal point is that of {usual[0]}x{usual[1]} px; fx {matrix[0, 0]:g} px is scaled to "
-        f"{scaled[0, 0]:g} px for {size[0]}x{size[1]}"
-    )
+    was, now = f"{matrix[0, 0]:g} px is scaled to", f"{scaled[0, 0]:g} px for {size[0]}x{size[1]}"
+    remarks.append(f"{path}: its principal point is that of {usual[0]}x{usual[1]} px; fx {was} {now}")
     return scaled
 
 
-def _centered(matrix: NDArray[np.float64], size: tuple[int, int]) -> bool:
-    off = np.abs(matrix[:2, 2] / size - 0.5)
-    return bool(off.max() <= OFF_CENTER)
+def _centered(matrix: NDArray[np.float64], size: Size) -> bool:
+    return bool(np.abs(matrix[:2, 2] / size - 0.5).max() <= OFF_CENTER)

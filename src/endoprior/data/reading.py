@@ -1,6 +1,8 @@
 """Read files of users: bytes, text, arrays and YAML. Regular files only, of bounded size; nothing in them is executed.
 
-A few lines of YAML with nested anchors can stand for billions of entries, and nesting can exhaust the stack.
+A few lines of YAML with nested anchors can stand for billions of entries, and nesting can exhaust the stack. All
+readers raise InputError for a file that is missing, unreadable, no regular file (a pipe could block forever), too
+large, or of another kind.
 """
 
 from __future__ import annotations
@@ -23,30 +25,20 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 
-MOST_BYTES = 1 << 30
-"""Largest size of one file, also after decompression."""
-MOST_PIXELS = 64_000_000
-"""Most pixels of one image; 7680x4320 has half as many. `endoprior/__init__.py` tells OpenCV the same."""
-MOST_TEXT_BYTES = 64 << 20
-"""Largest size of a JSON, YAML or text file."""
+MOST_BYTES = 1 << 30  # largest size of one file, also after decompression
+MOST_PIXELS = 64_000_000  # of one image; 7680x4320 has half as many. `endoprior/__init__.py` tells OpenCV the same
+MOST_TEXT_BYTES = 64 << 20  # largest size of a JSON, YAML or text file
+MOST_ARRAYS = 1000  # in one .npz file
+MOST_NODES = 100_000  # entries of a YAML text, each alias counted as often as it is used
+MOST_NESTED = 50
 ACCESS_HINT = "check the path and its permissions."
 Kind = Literal["a file", "a folder", "nothing", "a device or a pipe"]
-MOST_ARRAYS = 1000
-"""Largest number of arrays in one .npz file."""
-ZIP_START = b"PK"
 _BROKEN = (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError)
 _UNUSUAL = (RuntimeError, MemoryError, OverflowError)  # encrypted, unknown compression, nested header
-MOST_NODES = 100_000
-"""Largest number of entries, each alias counted as often as it is used."""
-MOST_NESTED = 50
 
 
 def kind_of(path: Path) -> Kind:
-    """What is at `path`, links followed; a broken link is nothing.
-
-    Raises:
-        InputError: the name is too long, or a folder above is not readable.
-    """
+    """What is at `path`, links followed; a broken link is nothing. InputError for a name or a parent of no use."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
@@ -75,14 +67,18 @@ def reading(path: Path, expected: str = "a readable file", fix: str = ACCESS_HIN
         raise input_error(path, expected, error.strerror or str(error), fix) from None
 
 
-def read_bytes(path: Path, expected: str = "a readable file", fix: str = ACCESS_HINT) -> NDArray[np.uint8]:
-    """(N,) bytes of a file.
+def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> None:
+    """Raise InputError unless `path` is a regular file of at most `most` bytes."""
+    kind = kind_of(path)
+    if kind != "a file":
+        raise input_error(path, expected, "No such file" if kind == "nothing" else kind, fix)
+    if (size := path.stat().st_size) > most:
+        raise input_error(path, f"at most {most >> 20} MB", f"{size >> 20} MB", fix)
 
-    Raises:
-        InputError: missing, unreadable, not a regular file (reading a pipe could block forever), or of more than
-            `MOST_BYTES`.
-    """
-    demand_file(path, expected, fix, MOST_BYTES)
+
+def read_bytes(path: Path, expected: str = "a readable file", fix: str = ACCESS_HINT) -> NDArray[np.uint8]:
+    """(N,) bytes of a file."""
+    demand_file(path, expected, fix)
     with reading(path, expected, fix):
         return np.fromfile(path, np.uint8)
 
@@ -92,8 +88,6 @@ def read_text(path: Path, expected: str, fix: str, *, or_latin_1: bool = False) 
 
     Args:
         or_latin_1: read other bytes as Latin-1, where only comments can have them.
-    Raises:
-        InputError: as `read_bytes`, up to `MOST_TEXT_BYTES`, or the bytes are no text.
     """
     demand_file(path, expected, fix, MOST_TEXT_BYTES)
     try:
@@ -110,7 +104,7 @@ def read_text(path: Path, expected: str, fix: str, *, or_latin_1: bool = False) 
 
 
 def _encoding(start: bytes) -> str:
-    """The encoding of a text that starts with these 4 bytes. The first character of our files is always ASCII."""
+    # The first character of our files is always ASCII, so that a zero byte beside it tells UTF-16.
     if start.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     if len(start) > 1 and (start[0] == 0) != (start[1] == 0):
@@ -118,31 +112,18 @@ def _encoding(start: bytes) -> str:
     return "utf-8-sig"
 
 
-def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> None:
-    """Raise InputError unless `path` is a regular file of at most `most` bytes."""
-    kind = kind_of(path)
-    if kind != "a file":
-        raise input_error(path, expected, "No such file" if kind == "nothing" else kind, fix)
-    if (size := path.stat().st_size) > most:
-        raise input_error(path, f"at most {most >> 20} MB", f"{size >> 20} MB", fix)
-
-
 def read_numpy(path: Path, expected: str, fix: str) -> NDArray | dict[str, NDArray]:
-    """The array of an .npy file, or the named arrays of an .npz file; no pickles.
-
-    Raises:
-        InputError: unreadable, not NumPy's, or larger than `MOST_BYTES`.
-    """
+    """The array of an .npy file, or the named arrays of an .npz file; no pickles."""
     stored = read_bytes(path, expected, fix).tobytes()
     try:
-        return _archive(stored) if stored.startswith(ZIP_START) else _array(stored)
+        return _archive(stored) if stored.startswith(b"PK") else _array(stored)
     except (*_BROKEN, *_UNUSUAL) as error:
         problem = (str(error) or type(error).__name__).split("\n")[0][:120]
     raise input_error(path, expected, problem, fix)
 
 
 def read_only_array(path: Path, fix: str) -> NDArray:
-    """The array of an .npy file, or the only one of an .npz file; otherwise as `read_numpy`."""
+    """The array of an .npy file, or the only one of an .npz file."""
     stored = read_numpy(path, "a NumPy file", fix)
     arrays = [stored] if isinstance(stored, np.ndarray) else list(stored.values())
     if len(arrays) != 1:
@@ -151,7 +132,6 @@ def read_only_array(path: Path, fix: str) -> NDArray:
 
 
 def _archive(stored: bytes) -> dict[str, NDArray]:
-    """The arrays of an .npz file; ValueError if they would be too large."""
     with ZipFile(io.BytesIO(stored)) as archive:
         members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
         # Python's zipfile never decompresses a member to more than its header says.
@@ -162,7 +142,6 @@ def _archive(stored: bytes) -> dict[str, NDArray]:
 
 
 def _array(stored: bytes) -> NDArray:
-    """The array in the bytes of an .npy file; ValueError or another error if they are not one."""
     file = io.BytesIO(stored)
     if not stored.startswith(np.lib.format.MAGIC_PREFIX):
         raise ValueError("pickled objects or something else" if stored else "an empty file")
@@ -182,12 +161,12 @@ def _array(stored: bytes) -> NDArray:
 
 
 class BoundedLoader(yaml.SafeLoader):
-    """Safe YAML of bounded nesting and size."""
+    """Safe YAML of bounded nesting and size, without one name twice."""
 
     _depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """One node of the text; an error if it is nested too deeply, before the parser's own stack overflows."""
+        """One node; an error if it is nested too deeply, before the parser's own stack overflows."""
         self._depth += 1
         if self._depth > MOST_NESTED:
             raise yaml.YAMLError(f"entries nested more than {MOST_NESTED} deep")
@@ -197,7 +176,7 @@ class BoundedLoader(yaml.SafeLoader):
             self._depth -= 1
 
     def get_single_node(self) -> Any:
-        """The whole text; an error if it has too many entries, or one name twice."""
+        """The whole text; an error if it has too many entries."""
         node = super().get_single_node()
         if node is not None and (size := _unfolded(node, {}, 0)) > MOST_NODES:
             raise yaml.YAMLError(f"{size:.0e} entries, aliases counted as often as used; at most {MOST_NODES} are read")
@@ -205,11 +184,7 @@ class BoundedLoader(yaml.SafeLoader):
 
 
 def load_yaml(text: str, loader: type[BoundedLoader] = BoundedLoader) -> Any:
-    """The data in a YAML text.
-
-    Raises:
-        yaml.YAMLError, ValueError: not YAML, tags of objects, too deep, or too many entries.
-    """
+    """The data in a YAML text; yaml.YAMLError or ValueError if it is none, or beyond the limits."""
     try:
         return yaml.load(text, loader)  # a safe loader, see above
     except RecursionError:
@@ -217,7 +192,7 @@ def load_yaml(text: str, loader: type[BoundedLoader] = BoundedLoader) -> Any:
 
 
 def _unfolded(node: yaml.Node, known: dict[int, int], depth: int) -> int:
-    """Entries that a node stands for; ValueError if it contains itself or if aliases nest too deeply."""
+    """Entries that a node stands for."""
     if id(node) in known:
         if not known[id(node)]:
             raise yaml.YAMLError("an entry that contains itself")
@@ -230,6 +205,6 @@ def _unfolded(node: yaml.Node, known: dict[int, int], depth: int) -> int:
         names = Counter(key.value for key, _ in parts if isinstance(key, yaml.ScalarNode) and key.value != "<<")
         if twice := [name for name, count in names.items() if count > 1]:
             raise yaml.YAMLError(f"the name {twice[0]!r} twice in one place")
-    flat = [part for pair in parts for part in pair] if isinstance(node, yaml.MappingNode) else parts
-    known[id(node)] = 1 + sum(_unfolded(part, known, depth + 1) for part in flat)
+        parts = [part for pair in parts for part in pair]
+    known[id(node)] = 1 + sum(_unfolded(part, known, depth + 1) for part in parts)
     return known[id(node)]

@@ -26,8 +26,7 @@ from .images import read_color, read_values
 from .poses import demand_rotations
 from .sequence import FrameSequence
 
-STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}
-"""Published frame stride of each dataset number."""
+STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}  # published frame stride of each dataset number
 BADLY_CALIBRATED = (4, 5)
 NEAR_MM, FAR_MM = 0.03, 300.0
 """Depth outside this range counts as missing. The near end is the published one, though probably a typo for 30."""
@@ -53,8 +52,7 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
     records = list_files(data / "frame_data", (".json",), "SCARED")
     for folder, suffix in FOLDERS.items():
         others = {file.stem for file in list_files(data / folder, (suffix,), "SCARED")}
-        odd = sorted({file.stem for file in records} ^ others)
-        if odd:
+        if odd := sorted({file.stem for file in records} ^ others):
             got = f"{len(others)}; {odd[0]} is in one of the two only"
             raise input_error(data / folder, f"the {len(records)} frames of frame_data", got, HINT)
     number, remarks = dataset_number(path), []
@@ -78,7 +76,7 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
     first_to_world = np.linalg.inv(to_camera[0])
     cameras = [
         Camera(width, height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose @ first_to_world)
-        for k, pose in ((one.matrix, one.world_to_camera) for one in geometry)
+        for k, pose, *_ in geometry
     ]
 
     def decode(index: int) -> Pixels:
@@ -100,13 +98,9 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
 
 
 def disparity_to_depth(disparity: NDArray[np.float32], reprojection: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Depth z = Q[2,3] / (Q[3,2] d + Q[3,3]) of disparity d.
+    """(H, W) depth z = Q[2,3] / (Q[3,2] d + Q[3,3]) of disparity d, px, and (4, 4) Q, in mm.
 
-    Args:
-        disparity: (H, W) px; missing where 0, negative or not finite.
-        reprojection: (4, 4) Q, for mm.
-    Returns:
-        (H, W) mm; 0 where missing or outside [NEAR_MM, FAR_MM].
+    It is 0 outside [NEAR_MM, FAR_MM], and where disparity is missing: 0, negative or not finite.
     """
     known = np.isfinite(disparity) & (disparity > 0)
     below = np.where(known, reprojection[3, 2] * disparity + reprojection[3, 3], 0)
@@ -133,14 +127,13 @@ def dataset_number(path: Path) -> int | None:
 
 
 class _Geometry(NamedTuple):
-    """Of one frame after rectification: K (3, 3), integer pixel centers; (4, 4) pose, mm; (4, 4) Q."""
+    """Of one frame after rectification."""
 
-    matrix: NDArray[np.float64]
-    world_to_camera: NDArray[np.float64]
-    reprojection: NDArray[np.float64]
+    matrix: NDArray[np.float64]  # (3, 3) K, px, integer pixel centers
+    world_to_camera: NDArray[np.float64]  # (4, 4), mm
+    reprojection: NDArray[np.float64]  # (4, 4) Q
     version: int
-    is_turned: bool
-    """Whether the rotation of the rectification is known."""
+    is_turned: bool  # whether the rotation of the rectification is known
 
 
 def _geometry(record: Path, geometry: Path, size: tuple[int, int]) -> _Geometry:
@@ -180,7 +173,8 @@ def _rectifying_rotation(record: Path, about: dict[str, Any], size: tuple[int, i
     shift = read_matrix(record, flat, "T", (1, 3))[0]
     if not shift.any():
         raise input_error(record, "a right camera beside the left one", "T of 0 mm", HINT)
-    return cv2.stereoRectify(left, None, right, None, size, turn, shift[:, None])[0]
+    straight = np.zeros(5)
+    return np.asarray(cv2.stereoRectify(left, straight, right, straight, size, turn, shift[:, None])[0], np.float64)
 
 
 FORMAT = Format(is_scared, load_scared)

@@ -1,14 +1,11 @@
-"""A sequence of frames that are read when first used, and its split into training and test frames.
+"""A sequence of frames that are read when first used, its parts, and its split into training and test frames.
 
 `T` frames; every 8th frame is a test frame, starting at frame 1, or later with another `test_phase`.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
@@ -21,17 +18,18 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..footage.right_view import right_frame
-from ..system.memory import BoundedCache, cache_bytes, workers
+from ..system.memory import BoundedCache, cache_bytes
+from .contents import demand_same, fingerprint_of, remarks_on, state_of
 from .description import ESTIMATED_POSES, TOOLS_FOUND
-from .reading import reading
 from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]
 TEST_EVERY = 8
-DECODING_BYTES = 40
-"""Memory per pixel while a frame is read."""
-TOOL_FRACTION_WARNING = 0.6
-"""With a larger share of tool pixels, the mask is probably inverted."""
+
+
+def is_test_frame(index: int, phase: int = 0) -> bool:
+    """Whether a frame is held out: indices 1, 9, 17, ... and `phase` frames later; phase 7 has 0, 8, 16, ..."""
+    return (index - 1) % TEST_EVERY == phase
 
 
 class FrameSpan(Protocol):
@@ -81,7 +79,7 @@ class FrameSequence:
     """How `load_sequence` read it; None for a sequence that was made in another way."""
 
     def __post_init__(self) -> None:
-        self._states = [_state(file) for file in self.files]
+        self._states = [state_of(file) for file in self.files]
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
         self._holds_out, self._first, self._test_phase = False, 0, 0
 
@@ -129,12 +127,18 @@ class FrameSequence:
             raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
         return self._cache.get(index, lambda: self._read_frame(index))
 
-    def indices(self, split: Split) -> list[int]:
-        """Ascending frame indices of a split: `test` has (i - 1) % 8 == `test_phase`, `train` the others, `video` all.
+    def frames(self, split: Split) -> FrameList:
+        """The frames of a split, decoded one by one as they are used."""
+        return FrameList(self, self.indices(split))
 
-        Raises:
-            ValueError: an unknown split.
-        """
+    def right_frame(self, index: int) -> Frame:
+        """Frame `index` as the right eye sees it: tissue is what both eyes see. There must be a right eye."""
+        if self.right_eye is None:
+            raise ValueError("a right frame needs a sequence with a right eye")
+        return right_frame(self.frame(index), self.right_eye.image(index), self.right_eye.baseline_mm)
+
+    def indices(self, split: Split) -> list[int]:
+        """Ascending frame indices: `test` has (i - 1) % 8 == `test_phase`, `train` the others, `video` all."""
         if split not in ("train", "test", "video"):
             raise ValueError(f"split must be train, test or video; got {split!r}")
         return [i for i in range(len(self)) if split == "video" or self._is_test(i) == (split == "test")]
@@ -153,24 +157,20 @@ class FrameSequence:
         return f"test iff (i - 1) % {TEST_EVERY} == {self._test_phase}"
 
     def with_test_phase(self, phase: int) -> FrameSequence:
-        """This sequence with another frame of every eight held out.
-
-        Raises:
-            InputError: it is too short, so that no frame would be held out.
-        """
+        """This sequence with another frame of every eight held out; InputError if none would be."""
         view = self._with(_test_phase=phase)
         if phase and not view.indices("test"):
             expected = f"a phase that leaves a test frame of {len(self)} frames"
             raise input_error("data.test_phase", expected, str(phase), "choose a lower one; 0 is the published split.")
         return view
 
-    def frames(self, split: Split) -> FrameList:
-        """The frames of a split, decoded one by one as they are used."""
-        return FrameList(self, self.indices(split))
-
     def training_view(self) -> FrameSequence:
         """What a method trains on: no ground truth and no right eye, and reading a test frame is an error."""
         return self._with(truth=None, right_eye=None, _holds_out=True)
+
+    def training_part(self, span: FrameSpan) -> FrameList:
+        """The training frames of a part of the sequence; see `part`."""
+        return self.part(span.start, span.stop).frames("train")
 
     def part(self, start: int, stop: int) -> FrameSequence:
         """Frames `start` to `stop` - 1 as a sequence of its own, without ground truth; held-out frames stay held out.
@@ -188,23 +188,6 @@ class FrameSequence:
             truth=None,
             right_eye=self.right_eye and self.right_eye.part(start, stop),
         )
-
-    def _with(self, **changes: Any) -> FrameSequence:
-        """A view of this sequence with other attributes; frames that are read in another way are cached anew."""
-        view = copy(self)
-        vars(view).update(changes)
-        if "_read_frame" in changes:
-            view._cache = BoundedCache(cache_bytes(), _frame_bytes)
-        return view
-
-    def training_part(self, span: FrameSpan) -> FrameList:
-        """The training frames of a part of the sequence; see `part`."""
-        return self.part(span.start, span.stop).frames("train")
-
-    def right_frame(self, index: int) -> Frame:
-        """Frame `index` as the right eye sees it: tissue is what both eyes see. There must be a right eye."""
-        left = self.frame(index)
-        return right_frame(left, self.right_eye.image(index), self.right_eye.baseline_mm)
 
     def without_masks(self) -> FrameSequence:
         """This sequence with its masks hidden: every pixel counts as tissue."""
@@ -224,22 +207,25 @@ class FrameSequence:
 
         A scene has poses of its own, in which it was trained: they are those to render it from.
         """
-        poses = [camera.world_to_camera for camera in cameras]
-        if all(np.array_equal(own.world_to_camera, pose) for own, pose in zip(self._cameras, poses, strict=True)):
+        pairs = list(zip(self._cameras, cameras, strict=True))
+        if all(np.array_equal(own.world_to_camera, other.world_to_camera) for own, other in pairs):
             return self
-        cameras = [replace(own, world_to_camera=p) for own, p in zip(self._cameras, poses, strict=True)]
+        posed = [replace(own, world_to_camera=other.world_to_camera) for own, other in pairs]
         return self._with(
-            _cameras=cameras, _read_frame=lambda index: replace(self._read_frame(index), camera=cameras[index])
+            _cameras=posed, _read_frame=lambda index: replace(self._read_frame(index), camera=posed[index])
         )
+
+    def _with(self, **changes: Any) -> FrameSequence:
+        """A view of this sequence with other attributes; frames that are read in another way are cached anew."""
+        view = copy(self)
+        vars(view).update(changes)
+        if "_read_frame" in changes:
+            view._cache = BoundedCache(cache_bytes(), _frame_bytes)
+        return view
 
     def fingerprint(self) -> str:
         """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
-        digest = hashlib.sha256()
-        for file in sorted(self.files):
-            digest.update(os.fsencode(file.relative_to(self.path).as_posix()) + b"\0")
-            with reading(file), file.open("rb") as content:
-                digest.update(hashlib.file_digest(content, "sha256").digest())
-        return digest.hexdigest()
+        return fingerprint_of(self.files, self.path)
 
     def demand_unchanged(self, fingerprint: str | None = None) -> None:
         """Raise InputError if a file changed since the sequence was opened, so that frames of two states may be mixed.
@@ -247,65 +233,18 @@ class FrameSequence:
         Args:
             fingerprint: that of the sequence; files with other times and the same contents are accepted. None: not.
         """
-        states = [_state(file) for file in self.files]
-        if states == self._states:
-            return
-        if fingerprint is not None and self.fingerprint() == fingerprint:
-            self._states = states
-            return
-        changed = next(f for f, now, then in zip(self.files, states, self._states, strict=True) if now != then)
-        fix = "Put the data back and resume, or train on the new data in a new folder."
-        raise input_error(changed, "data that stays as it is during training", "a file that was changed", fix)
+        states = [state_of(file) for file in self.files]
+        if states != self._states and (fingerprint is None or self.fingerprint() != fingerprint):
+            demand_same(self.files, states, self._states)
+        self._states = states
 
     def validate(self) -> list[str]:
-        """Decode every frame and check that the sequence can be trained on.
+        """Decode every frame, and return remarks about what is unusual but usable, one line each.
 
-        Returns:
-            Remarks about what is unusual but usable, one line each.
         Raises:
             InputError: a file cannot be used, or no frame has tissue, or no tissue pixel has depth.
         """
-        camera = self.camera(0)
-        threads = workers(DECODING_BYTES * camera.width * camera.height)
-        with ThreadPoolExecutor(threads) as pool:  # decoding releases the interpreter lock
-            contents = list(pool.map(lambda index: _contents(self._decoded(index)), range(len(self))))
-        tissue = [share for share, _, _ in contents]
-        if not any(tissue):
-            hint = "the polarity may be inverted: masks are 255 on tools."
-            raise input_error(self.path / self.mask_name, "tissue in at least one frame", "tool everywhere", hint)
-        if not any(has_depth for _, has_depth, _ in contents):
-            hint = "provide depth in mm, 0 where it is missing."
-            raise input_error(self.path / "depth", "depth > 0 in at least one frame", "0 everywhere", hint)
-        if not any(contents[index][2] for index in self.indices("train")):
-            hint = "the mask's polarity may be inverted, or the depth may be of the tool only."
-            raise input_error(self.path / "depth", "depth on tissue in a training frame", "none", hint)
-        remarks = list(self.remarks)
-        tool = 1 - sum(tissue) / len(tissue)
-        if tool > TOOL_FRACTION_WARNING:
-            remarks.append(
-                f"{self.path / self.mask_name}: {tool:.0%} of all pixels are masked; the polarity may be inverted"
-            )
-        if self.depth_is_relative:
-            remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths are not millimeters")
-        empty = [index for index, (_, _, has_tissue_depth) in enumerate(contents) if not has_tissue_depth]
-        if empty:
-            remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
-        return remarks
-
-
-def _state(file: Path) -> tuple[int, int, int] | None:
-    """What changes with the contents of a file, without reading them; None if there is no such file."""
-    try:
-        facts = file.stat()
-    except OSError:
-        return None
-    return facts.st_mtime_ns, facts.st_ctime_ns, facts.st_size
-
-
-def _contents(frame: Frame) -> tuple[float, bool, bool]:
-    """Share of tissue; whether any pixel has depth; whether any tissue pixel has depth."""
-    measured = frame.depth_valid & frame.tissue_mask
-    return float(frame.tissue_mask.mean()), bool(frame.depth_valid.any()), bool(measured.any())
+        return remarks_on(self, self._decoded)
 
 
 def _frame_bytes(frame: Frame) -> int:
@@ -313,12 +252,10 @@ def _frame_bytes(frame: Frame) -> int:
 
 
 class FrameList(Sequence[Frame]):
-    """A read-only list of frames; each is decoded when it is used."""
+    """The frames of a sequence with these indices, read-only and in this order; each is decoded when it is used."""
 
     def __init__(self, sequence: FrameSequence, indices: list[int]) -> None:
-        """Args: sequence: source of the frames. indices: of the frames, in order."""
-        self.sequence = sequence
-        self.indices = indices
+        self.sequence, self.indices = sequence, indices
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -332,8 +269,3 @@ class FrameList(Sequence[Frame]):
         if isinstance(position, slice):
             return FrameList(self.sequence, self.indices[position])
         return self.sequence.frame(self.indices[position])
-
-
-def is_test_frame(index: int, phase: int = 0) -> bool:
-    """Whether a frame is held out: indices 1, 9, 17, ... and `phase` frames later; phase 7 has 0, 8, 16, ..."""
-    return (index - 1) % TEST_EVERY == phase

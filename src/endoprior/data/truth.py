@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,29 +13,24 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..core.geometry import FARTHEST_MM
-from .description import LEAST, MOST
+from .description import LEAST, MOST, is_number
 from .files import IMAGE_SUFFIXES, files_with, read_json
 from .frame_files import match_names
-from .images import read_color, read_header
+from .images import Size, read_color, read_header
 from .pixels import shrunk_color
 from .poses import ROTATION_TOLERANCE, demand_rotations
 from .reading import read_bytes, read_numpy
 
 _AGAIN = "write the truth again."
-FOLDER = "right"
-"""Name of the folder of the right images."""
 
 
 @dataclass(frozen=True)
 class Tracks:
     """Material points that move with the tissue."""
 
-    points: NDArray[np.float32]
-    """(T, P, 3) positions in camera axes, mm."""
-    visible: NDArray[np.bool_]
-    """(T, P) True where the point is in the image and not occluded."""
-    paired: bool = True
-    """False if points of the first and the last frame are not matched, as in STIR: each is visible once."""
+    points: NDArray[np.float32]  # (T, P, 3) positions in camera axes, mm
+    visible: NDArray[np.bool_]  # (T, P) True where the point is in the image and not occluded
+    paired: bool = True  # False if points of both ends are not matched, as in STIR: each is visible once
     region: NDArray[np.str_] | None = None
     """(P,) part of the tissue each point lies in, such as `pulled` or `smooth`; None if unknown."""
 
@@ -48,15 +43,15 @@ class Truth:
         self.folder = folder
         self._names = names
 
-    def tissue(self, index: int) -> NDArray[np.uint8] | None:
-        """(H, W, 3) image of frame `index` without the tool, 0..255."""
-        path = self.folder / "tissue" / f"{self._names[index]}.png"
-        return read_color(path) if path.parent.is_dir() else None
-
     def _array(self, name: str) -> NDArray | dict[str, NDArray] | None:
         """What a NumPy file of the folder holds; None without."""
         path = self.folder / name
         return read_numpy(path, "a NumPy file", _AGAIN) if path.exists() else None
+
+    def tissue(self, index: int) -> NDArray[np.uint8] | None:
+        """(H, W, 3) image of frame `index` without the tool, 0..255."""
+        path = self.folder / "tissue" / f"{self._names[index]}.png"
+        return read_color(path) if path.parent.is_dir() else None
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
@@ -74,14 +69,14 @@ class Truth:
         path = self.folder / "side" / "world_to_camera.json"
         if not path.exists():
             return {}
-        stored = read_json(path)
-        wrong = input_error(path, "finite poses of shape (4, 4)", "something else", _AGAIN)
         try:
-            poses = {name: np.asarray(pose, np.float64) for name, pose in stored.items()}
-        except (TypeError, ValueError):
-            raise wrong from None
+            poses = {name: np.asarray(pose, np.float64) for name, pose in read_json(path).items()}
+        except (TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            poses = {"": np.zeros(0)}
         if not all(pose.shape == (4, 4) and np.isfinite(pose).all() for pose in poses.values()):
-            raise wrong
+            raise input_error(path, "finite poses of shape (4, 4)", "something else", _AGAIN)
         return poses
 
     def side(self, name: str, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]] | None:
@@ -122,49 +117,40 @@ class Truth:
             raise input_error(path, "arrays points and visible", got, _AGAIN)
         points, visible = np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool)
         region = np.asarray(stored["region"], str) if "region" in stored else None
-        tracks = Tracks(points, visible, bool(stored.get("paired", True)), region)
-        frames, count = tracks.visible.shape if tracks.visible.ndim == 2 else (-1, -1)
-        if frames != len(self._names) or tracks.points.shape != (frames, count, 3):
-            got = f"{tracks.points.shape} and {tracks.visible.shape}"
+        if visible.ndim != 2 or len(visible) != len(self._names) or points.shape != (*visible.shape, 3):
             want = f"shapes (T, P, 3) and (T, P) with T = {len(self._names)}"
-            raise input_error(path, want, got, _AGAIN)
-        if region is not None and region.shape != (count,):
-            raise input_error(path, f"a region of shape ({count},)", f"{region.shape}", _AGAIN)
-        return tracks
+            raise input_error(path, want, f"{points.shape} and {visible.shape}", _AGAIN)
+        if region is not None and region.shape != visible.shape[1:]:
+            raise input_error(path, f"a region of shape {visible.shape[1:]}", f"{region.shape}", _AGAIN)
+        return Tracks(points, visible, bool(stored.get("paired", True)), region)
 
 
+@dataclass(frozen=True)
 class RightEye:
     """The right pictures of a rectified pair; each is decoded when it is used.
 
     The right camera has the lens of the left one, turned like it, and stands `baseline_mm` along its +x axis.
     """
 
-    def __init__(self, files: list[Path], baseline_mm: float, size: tuple[int, int], shrink: int = 1) -> None:
-        """Describe the pictures; nothing is decoded yet.
-
-        Args:
-            files: the right picture of each frame.
-            baseline_mm: distance of the cameras, > 0.
-            size: (width, height) of the files, px.
-            shrink: pictures are this many times smaller than the files.
-        """
-        self.files, self.baseline_mm = files, baseline_mm
-        self._size, self._shrink = size, shrink
+    files: list[Path]  # of each frame
+    baseline_mm: float
+    size: Size  # of the files, px
+    shrink: int = 1  # pictures are this many times smaller than the files
 
     def part(self, start: int, stop: int) -> RightEye:
         """The pictures of frames `start` to `stop` - 1."""
-        return RightEye(self.files[start:stop], self.baseline_mm, self._size, self._shrink)
+        return replace(self, files=self.files[start:stop])
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """(H, W, 3) right picture of frame `index` at the size of the left one, 0..255."""
-        return shrunk_color(read_color(self.files[index], self._size), self._shrink)
+        return shrunk_color(read_color(self.files[index], self.size), self.shrink)
 
 
 def open_right_eye(
     path: Path,
     images: list[Path],
     kept: list[int],
-    size: tuple[int, int],
+    size: Size,
     described: dict[str, Any],
     shrink: int,
     remarks: list[str],
@@ -174,16 +160,12 @@ def open_right_eye(
     """The right eye of a sequence folder, if it has one that can be used; else a remark says why not.
 
     Args:
-        path: the folder; nothing is said of one without `right/`.
-        images: the left picture of every frame in the folder.
+        images, size: the left picture of every frame in the folder, and their (width, height), px.
         kept: positions in `images` of the frames to read.
-        size: (width, height) of the left pictures, px.
         described: contents of `sequence.json`, of which `baseline_mm` is used.
-        shrink: see `RightEye`.
-        remarks: gets the reason, or that the files are matched in order.
         relative: whether the scale of depth is unknown: then a baseline in mm does not fit the scene.
     """
-    folder = path / FOLDER
+    folder = path / "right"
     if not folder.is_dir():
         return None
     files, baseline = files_with(folder, IMAGE_SUFFIXES), described.get("baseline_mm")
@@ -195,14 +177,14 @@ def open_right_eye(
         reason = f"it has {len(files)} images, not one of the name or number of each of the {len(images)} in images/"
     elif baseline is None:
         reason = "sequence.json has no baseline_mm, the distance between the cameras"
-    elif isinstance(baseline, bool) or not isinstance(baseline, int | float) or not LEAST <= baseline <= MOST:
+    elif not is_number(baseline):
         reason = f"baseline_mm in sequence.json is {repr(baseline)[:60]}, not a number in [{LEAST:g}, {MOST:g}]"
     elif relative:
         reason = "the scale of the depth is unknown, and the distance between the cameras is in mm"
     elif not (found := read_header(read_bytes(files[matched.files[0]]).tobytes())) or found[:2] != size:
         got = f"{found.width}x{found.height} px" if found else "no size that can be read"
         reason = f"its first image has {got}, and the left one {size[0]}x{size[1]} px"
-    if reason or matched is None:
+    if reason or matched is None or baseline is None:
         remarks.append(f"{folder}: ignored, because {reason}")
         return None
     remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []

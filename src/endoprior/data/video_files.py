@@ -21,10 +21,8 @@ CONTAINERS = (
     "yuv4mpegpipe,mjpeg,apng,vvc,cine,h263,dnxhd"
 )
 """FFmpeg formats that hold images themselves. Playlists are excluded: they name other files and addresses."""
-STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-"""Images that `prepare` reads from a folder."""
-PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"<MPD", b"<smil", b"[playlist]")
-"""What stands in the first bytes of playlists."""
+STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # of images that `prepare` reads from a folder
+PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"<MPD", b"<smil", b"[playlist]")  # in the first bytes of playlists
 HEADS = {
     "flv": rb"FLV\x01[\x01\x04\x05]\x00\x00\x00\x09",
     "asf": rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11\xa6\xd9\x00\xaa\x00\x62\xce\x6c",
@@ -36,11 +34,7 @@ STILLS = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"RIFF")
 
 
 def open_container(path: Path) -> InputContainer:
-    """Open a video file with FFmpeg.
-
-    Raises:
-        av.error.FFmpegError, OSError, UnicodeError: it is no video that can be read.
-    """
+    """Open a video file with FFmpeg; av.error.FFmpegError, OSError or UnicodeError if it cannot be read."""
     import av
 
     # The scheme keeps FFmpeg from reading a colon in the name as an address; the lists restrict it to this file. FFmpeg
@@ -53,12 +47,12 @@ def is_video(path: Path) -> bool:
     """Whether an existing file has the suffix of a video, or FFmpeg finds images in it."""
     if path.suffix.lower() in VIDEO_SUFFIXES or is_animated_webp(path):
         return True
-    import av
+    from av.error import FFmpegError
 
     try:
         with open_container(path) as container:
             return bool(container.streams.video)
-    except (av.error.FFmpegError, OSError, UnicodeError):
+    except (FFmpegError, OSError, UnicodeError):
         return False
 
 
@@ -68,11 +62,27 @@ def is_animated_webp(path: Path) -> bool:
     return head[:4] == b"RIFF" and head[8:16] == b"WEBPVP8X" and bool(head[20] & 2)
 
 
-def starts_of_parts(path: Path, name: str) -> list[int]:
-    """Where files begin, in bytes, that were written one after the other into this one; FFmpeg may not read them all.
+def what_it_is(path: Path) -> str:
+    """What a file is that FFmpeg takes for no video of `CONTAINERS`, in words; empty if unknown."""
+    head = _head(path)
+    if any(mark in head for mark in PLAYLISTS):
+        return "a playlist, which only names other files"
+    return "one image" if head.startswith(STILLS) else ""
 
-    Args:
-        name: FFmpeg's name of the format.
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, at least 32 of them; zeros for what is not there."""
+    try:
+        with path.open("rb") as file:
+            return file.read(512).ljust(32, b"\0")
+    except OSError:
+        return bytes(32)
+
+
+def starts_of_parts(path: Path, name: str) -> list[int]:
+    """Where files begin, in bytes, that were written one after the other into this one, of a format of FFmpeg's name.
+
+    FFmpeg may not read them all.
     """
     if "mp4" in name:
         return _starts_of_mp4(path)
@@ -96,20 +106,3 @@ def _starts_of_mp4(path: Path) -> list[int]:
                 break
             at += length
     return starts
-
-
-def what_it_is(path: Path) -> str:
-    """What a file is that FFmpeg takes for no video of `CONTAINERS`, in words; empty if unknown."""
-    head = _head(path)
-    if any(mark in head for mark in PLAYLISTS):
-        return "a playlist, which only names other files"
-    return "one image" if head.startswith(STILLS) else ""
-
-
-def _head(path: Path) -> bytes:
-    """The first bytes of a file, at least 32 of them; zeros for what is not there."""
-    try:
-        with path.open("rb") as file:
-            return file.read(512).ljust(32, b"\0")
-    except OSError:
-        return bytes(32)

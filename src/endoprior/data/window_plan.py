@@ -23,39 +23,29 @@ SHORTEST = 40
 OVERLAP = 20
 """Frames that a window shares with the next one: in the middle half of them one fades into the other. With ten frames a
 window is worse by up to 4 dB near its end."""
-THUMBNAIL = (32, 24)
-"""(width, height) of the pictures that are compared, px: noise and texture are averaged out."""
+THUMBNAIL = (32, 24)  # (width, height) of the pictures that are compared, px: noise and texture are averaged out
 
 
 @dataclass(frozen=True)
 class Looks:
     """What the frames show, in short; `T` frames."""
 
-    thumbnails: NDArray[np.float32]
-    """(T, h, w, 3) color in [0, 1]."""
-    depth_mm: NDArray[np.float64]
-    """(T,) median of the measured depth; NaN without."""
+    thumbnails: NDArray[np.float32]  # (T, h, w, 3) color in [0, 1]
+    depth_mm: NDArray[np.float64]  # (T,) median of the measured depth; NaN without
 
 
 def look_through(sequence: FrameSequence) -> Looks:
     """Decode every training frame once; a held-out frame counts as the training frame before it, or the first one."""
-    thumbnails = np.zeros((len(sequence), *THUMBNAIL[::-1], 3), np.float32)
-    depth_mm = np.full(len(sequence), np.nan)
-    training = sequence.indices("train")
-    known = set(training)
-    for index in range(len(sequence)):
-        if index not in known:
-            if index:
-                thumbnails[index], depth_mm[index] = thumbnails[index - 1], depth_mm[index - 1]
-            continue
-        frame = sequence.frame(index)
+    training = np.array(sequence.indices("train"))
+    thumbnails = np.zeros((len(training), *THUMBNAIL[::-1], 3), np.float32)
+    depth_mm = np.full(len(training), np.nan)
+    for position, frame in enumerate(sequence.frames("train")):
         small = cv2.resize(frame.rgb_u8, THUMBNAIL, interpolation=cv2.INTER_AREA)
-        thumbnails[index] = small.astype(np.float32) / 255
+        thumbnails[position] = small.astype(np.float32) / 255
         measured = frame.depth[frame.depth_valid & frame.tissue_mask]
-        depth_mm[index] = np.median(measured) if measured.size else np.nan
-    first = training[0]
-    thumbnails[:first], depth_mm[:first] = thumbnails[first], depth_mm[first]
-    return Looks(thumbnails, depth_mm)
+        depth_mm[position] = np.median(measured) if measured.size else np.nan
+    shown = np.maximum(np.searchsorted(training, np.arange(len(sequence)), "right") - 1, 0)
+    return Looks(thumbnails[shown], depth_mm[shown])
 
 
 def plan_windows(cameras: Sequence[Camera], looks: Looks, longest: int) -> list[tuple[int, int]]:

@@ -20,42 +20,27 @@ from ..system.atomic import whole_folder
 from .folder_edits import depth_bounds, pose_table
 from .images import decode_image, save_png
 
-FARTHEST_UNIT = 65534
-"""Of the depth files; 65535 stands for missing depth in the files of many programs."""
-TOOL_VALUE = 255
-"""Value of tool pixels in `masks/`; tissue is 0."""
+FARTHEST_UNIT = 65534  # of the depth files; 65535 stands for missing depth in the files of many programs
+TOOL_VALUE = 255  # Value of tool pixels in `masks/`; tissue is 0
 
 
 @dataclass(frozen=True)
 class SequenceMeta:
     """The facts of a sequence that its images do not hold."""
 
-    width: int
-    """px."""
+    width: int  # px, as the next five
     height: int
-    """px."""
     fx: float
-    """Focal length along x, px."""
     fy: float
-    """Focal length along y, px."""
-    cx: float
-    """Principal point x, px; the left-most pixel is centered at 0.5."""
+    cx: float  # the left-most pixel is centered at 0.5
     cy: float
-    """Principal point y, px."""
     frames_per_second: float
-    """1/s."""
-    baseline_mm: float | None = None
-    """Distance between the left and the right camera, mm; None for a monocular sequence."""
-    depth_scale: float = 0.01
-    """mm per unit of the 16-bit depth PNG."""
-    depth_source: str | None = None
-    """Origin of the depth, for example `stereo`; None without depth."""
-    depth_relative: bool = False
-    """Whether the depth's scale is assumed, so that lengths are not millimeters."""
-    sources: dict[str, str] = field(default_factory=dict)
-    """Origin of each part of the sequence; no paths, which may hold names."""
-    note: str = ""
-    """A note for users of the sequence."""
+    baseline_mm: float | None = None  # between the left and the right camera; None for a monocular sequence
+    depth_scale: float = 0.01  # mm per unit of the 16-bit depth PNG
+    depth_source: str | None = None  # origin of the depth, for example `stereo`; None without depth
+    depth_relative: bool = False  # whether the depth's scale is assumed, so that lengths are not millimeters
+    sources: dict[str, str] = field(default_factory=dict)  # origin of each part; no paths, which may hold names
+    note: str = ""  # for users of the sequence
 
 
 class FrameFiles:
@@ -74,13 +59,9 @@ class FrameFiles:
         depth: NDArray[np.float32] | None = None,
         right: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Append one frame.
+        """Append one frame: image, mask that is True on tools, and z in mm, 0 or not finite where it is missing.
 
-        Args:
-            rgb: (H, W, 3) image, 0..255.
-            tool_mask: (H, W) True where a tool is.
-            depth: (H, W) z in mm, 0 or not finite where missing; None in every frame for a sequence without depth.
-            right: (H, W, 3) image of the right camera, 0..255; None in every frame of a monocular sequence.
+        Depth and the image of the right camera are there in every frame of a sequence, or in none.
         """
         size = (self.meta.height, self.meta.width)
         for name, array in (("rgb", rgb), ("tool_mask", tool_mask), ("depth", depth), ("right", right)):
@@ -95,20 +76,13 @@ class FrameFiles:
         self.count += 1
 
     def depth_units(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-        """(H, W) depth as a file stores it; 0 where it is missing or too far. Args: depth: (H, W) z in mm."""
+        """(H, W) z in mm as a file stores it; 0 where it is missing or too far."""
         units = np.round(np.where(np.isfinite(depth) & (depth > 0), depth, 0) / self.meta.depth_scale)
         return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
     def write_image(self, folder: str, pixels: NDArray) -> None:
-        """Write `pixels` as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends.
-
-        Args:
-            folder: relative to the sequence, for example `truth/tissue`.
-            pixels: (H, W, 3) RGB 8-bit, or (H, W) 8- or 16-bit.
-        """
-        path = self._file(f"{folder}/{self.count:06d}.png")
-        # Fast compression: noise does not compress well anyway.
-        save_png(path, pixels, 2)
+        """Write an image (`encode_png`) as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends."""
+        save_png(self._file(f"{folder}/{self.count:06d}.png"), pixels, 2)  # noise does not compress well anyway
 
     def write_array(self, name: str, array: NDArray) -> None:
         """Write `name` (relative, `.npy`)."""
@@ -116,7 +90,7 @@ class FrameFiles:
 
     def write_arrays(self, name: str, **arrays: NDArray) -> None:
         """Write named arrays to `name` (relative, `.npz`)."""
-        np.savez_compressed(self._file(name), **arrays)
+        np.savez_compressed(self._file(name), allow_pickle=False, **arrays)
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write `content` to `name` (relative, `.json`)."""
@@ -135,7 +109,9 @@ class FrameFiles:
             raise ValueError("a sequence must have at least one frame; got none")
         meta = self.meta
         cameras = np.broadcast_to(np.eye(4), (self.count, 4, 4)) if camera_to_world is None else camera_to_world
-        bounds = np.array([self._depth_bounds(index) for index in range(self.count)])
+        depths = [self.file("depth", index) for index in range(self.count)]
+        stored = (decode_image(path, None) if path.exists() else np.zeros(0, np.uint16) for path in depths)
+        bounds = np.array([depth_bounds(each, meta.depth_scale) for each in stored])
         self.write_array("poses_bounds.npy", pose_table(cameras, meta.height, meta.width, meta.fx, bounds))
         fixed = {"format_version": 1, "depth_unit": "mm", "mask_tool_value": TOOL_VALUE}
         described = fixed | asdict(meta) | {"unexplained_frames": unexplained_frames or []}
@@ -144,12 +120,6 @@ class FrameFiles:
     def file(self, folder: str, index: int) -> Path:
         """Path of the image of frame `index` in `folder`."""
         return self.folder / folder / f"{index:06d}.png"
-
-    def _depth_bounds(self, index: int) -> tuple[float, float]:
-        """Nearest and farthest depth of a written frame, mm; (0, 0) without depth."""
-        path = self.file("depth", index)
-        stored = decode_image(path, None) if path.exists() else np.zeros(0, np.uint16)
-        return depth_bounds(stored, self.meta.depth_scale)
 
     def _file(self, name: str) -> Path:
         """Path of a file in the folder; creates its parents."""
@@ -160,11 +130,7 @@ class FrameFiles:
 
 @contextmanager
 def new_sequence(out: Path, meta: SequenceMeta) -> Iterator[FrameFiles]:
-    """Collect the frames of one sequence; `out` appears complete when the block ends, and not at all after an error.
-
-    Raises:
-        InputError: `out` is a file or a folder that is not empty, or cannot be created.
-    """
+    """Collect the frames of one sequence; `out` appears complete when the block ends, and not at all after an error."""
     with whole_folder(Path(out)) as folder:
         files = FrameFiles(folder, meta)
         yield files

@@ -14,15 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError
-from ..core.types import Camera
 from ..data import FrameList, FrameSequence, Split
 from ..model.scene import RenderedScene, Scene
 from ..system.atomic import write_json
 from ..system.memory import BoundedCache, cache_bytes
 from .score import ScoreUnavailable, mean_over_frames
 
-OUTLIER_DB = 3.0
-"""A frame whose PSNR lies this far below the median of its split is an outlier."""
+OUTLIER_DB = 3.0  # A frame whose PSNR lies this far below the median of its split is an outlier
 EXACT = "infinite: the rendered frames equal the true ones exactly"
 """Why there is no PSNR where no frame has any error; black frames, for example."""
 NETWORKS_OFF = "network scores were not asked for"
@@ -46,24 +44,22 @@ class Reconstruction(Protocol):
     """
 
     def render(self, index: int) -> Rendering:
-        """Frame `index` of the sequence, 0-based, at its time and from its camera, without tool.
-
-        Raises:
-            ScoreUnavailable: there is no such image; scores that need it are skipped with this reason.
+        """Frame `index` of the sequence, 0-based, at its time and from its camera, without tool; ScoreUnavailable where
+        there is none: scores that need it are skipped with this reason.
         """
         ...
 
 
+@dataclass(frozen=True)
 class SceneFrames:
     """A scene, rendered at the times and from the cameras of a sequence."""
 
-    def __init__(self, scene: RenderedScene, sequence: FrameSequence) -> None:
-        """Args: scene: what to render. sequence: times and cameras."""
-        self.scene, self._sequence = scene, sequence
+    scene: RenderedScene
+    sequence: FrameSequence
 
     def render(self, index: int) -> Rendering:
         """See `Reconstruction.render`."""
-        frame = self._sequence.frame(index)
+        frame = self.sequence.frame(index)
         out = self.scene.render(frame.time, frame.camera)
         return out.color.cpu().numpy(), out.depth.cpu().numpy()
 
@@ -72,25 +68,24 @@ class SceneFrames:
 class RenderedFrame:
     """One rendered frame."""
 
-    color: NDArray[np.float32] | None
-    """(H, W, 3) in [0, 1], not rounded; kept for frames of the split only."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3) rounded to 8 bits: what the published protocol scores."""
-    rendered_depth: NDArray[np.float32] | None
-    """(H, W) z, mm; None if there is none."""
+    split_color: NDArray[np.float32] | None  # `color`, or None outside of the split, to save memory
+    rgb_u8: NDArray[np.uint8]  # (H, W, 3) rounded to 8 bits: what the published protocol scores
+    rendered_depth: NDArray[np.float32] | None  # (H, W) z, mm; None if there is none
+
+    @property
+    def color(self) -> NDArray[np.float32]:
+        """(H, W, 3) in [0, 1], not rounded; of frames of the split only."""
+        assert self.split_color is not None, "this frame is outside of the split"
+        return self.split_color
 
     @property
     def rgb(self) -> NDArray[np.float32]:
         """(H, W, 3) `rgb_u8` in [0, 1]."""
-        return self.rgb_u8 / np.float32(255)
+        return np.asarray(self.rgb_u8 / np.float32(255), np.float32)
 
     @property
     def depth(self) -> NDArray[np.float32]:
-        """(H, W) z, mm; of a scene the sum of weight * z.
-
-        Raises:
-            ScoreUnavailable: no depth was rendered.
-        """
+        """(H, W) z, mm; of a scene the sum of weight * z. ScoreUnavailable without rendered depth."""
         if self.rendered_depth is None:
             raise ScoreUnavailable(NO_DEPTH)
         return self.rendered_depth
@@ -98,14 +93,13 @@ class RenderedFrame:
     @property
     def nbytes(self) -> int:
         """Memory it takes."""
-        return sum(array.nbytes for array in (self.color, self.rgb_u8, self.rendered_depth) if array is not None)
+        return sum(array.nbytes for array in (self.split_color, self.rgb_u8, self.rendered_depth) if array is not None)
 
 
 class RenderedFrames:
     """Rendered frames by index: each is rendered when first asked for, and kept as memory allows."""
 
     def __init__(self, reconstruction: Reconstruction, sequence: FrameSequence, split: Split) -> None:
-        """Args: sequence: size of the frames. split: frames that keep their unrounded color."""
         self._reconstruction, self._sequence = reconstruction, sequence
         self._scored = set(sequence.indices(split))
         self._cache: BoundedCache[RenderedFrame] = BoundedCache(cache_bytes(), lambda rendered: rendered.nbytes)
@@ -115,21 +109,17 @@ class RenderedFrames:
 
     def _render(self, index: int) -> RenderedFrame:
         color, depth = self._reconstruction.render(index)
-        if problem := _problem(color, depth, self._sequence.camera(index)):
+        camera, problem = self._sequence.camera(index), ""
+        size = camera.height, camera.width
+        for name, array, shape in (("depth", depth, size), ("color", color, (*size, 3))):
+            if array is not None and (array.shape != shape or array.dtype != np.float32):
+                problem = f"expected {name} of shape {shape} and type float32, got {array.shape} and {array.dtype}"
+        if not problem and not (color.min() >= 0 and color.max() <= 1):  # NaN fails too
+            problem = f"expected color in [0, 1], got {color.min():g} to {color.max():g}"
+        if problem:
             maker = type(self._reconstruction).__name__
             raise InputError(f"{maker}.render({index}): {problem}. Fix: Correct the method that returned it.")
         return RenderedFrame(color if index in self._scored else None, to_uint8(color), depth)
-
-
-def _problem(color: NDArray, depth: NDArray | None, camera: Camera) -> str:
-    """What is wrong with a rendered frame; empty if nothing is."""
-    size = (camera.height, camera.width)
-    for name, array, shape in (("color", color, (*size, 3)), ("depth", depth, size)):
-        if array is not None and (array.shape != shape or array.dtype != np.float32):
-            return f"expected {name} of shape {shape} and type float32, got {array.shape} and {array.dtype}"
-    if not (color.min() >= 0 and color.max() <= 1):  # NaN fails too
-        return f"expected color in [0, 1], got {color.min():g} to {color.max():g}"
-    return ""
 
 
 @dataclass
@@ -161,11 +151,7 @@ class Evaluation:
         return [index for index, value in scored if value < median - OUTLIER_DB]
 
     def save(self, folder: Path) -> Path:
-        """Write `metrics.json` and `per_frame.json`; for other splits than test `metrics_SPLIT.json` and so on.
-
-        Returns:
-            The file of the scores.
-        """
+        """Write `metrics.json`, which is returned, and `per_frame.json`; `metrics_SPLIT.json` of another split."""
         suffix = "" if self.protocol["split"] == "test" else f"_{self.protocol['split']}"
         file = folder / f"metrics{suffix}.json"
         facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
@@ -203,11 +189,7 @@ class EvaluationContext:
 
     @property
     def video(self) -> FrameList:
-        """All frames of the sequence, for scores that render every one of them.
-
-        Raises:
-            ScoreUnavailable: that would take hours.
-        """
+        """All frames of the sequence, for scores that render each; ScoreUnavailable where that would take hours."""
         scene = self.reconstruction.scene if isinstance(self.reconstruction, SceneFrames) else None
         if scene is not None and not isinstance(scene, Scene) and scene.device.type == "cpu":
             raise ScoreUnavailable(TOO_SLOW)
@@ -220,25 +202,18 @@ class EvaluationContext:
 
     @property
     def rendered_scene(self) -> RenderedScene:
-        """What renders the tissue from any camera, for scores that the frames' own images do not have.
-
-        Raises:
-            ScoreUnavailable: only rendered images are scored.
-        """
+        """What renders the tissue from any camera; ScoreUnavailable where only rendered images are scored."""
         if not isinstance(self.reconstruction, SceneFrames):
             raise ScoreUnavailable(NO_SCENE)
         return self.reconstruction.scene
 
     @property
     def scene(self) -> Scene:
-        """The Gaussians and their motion, for scores of these.
-
-        Raises:
-            ScoreUnavailable: only rendered images are scored, or a scene without Gaussians.
-        """
-        if not isinstance(self.rendered_scene, Scene):
+        """The Gaussians and their motion; ScoreUnavailable for rendered images, or a scene without Gaussians."""
+        scene = self.rendered_scene
+        if not isinstance(scene, Scene):
             raise ScoreUnavailable(NO_GAUSSIANS)
-        return self.rendered_scene
+        return scene
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """See `Evaluation.add`."""
@@ -253,10 +228,8 @@ class EvaluationContext:
         self.add(name, mean_over_frames(values), EXACT if math.inf in values else reason)
 
     def add_frames(self, rows: Sequence[dict[str, float]], reason: str) -> None:
-        """Record scores that every frame has: finite values in `per_frame`, their mean, or `reason`, as the score.
-
-        Args:
-            rows: one value by score name for each frame of the split.
+        """Record scores that every frame has, one row by name for each frame of the split: finite values in
+        `per_frame`, their mean, or `reason`, as the score.
         """
         for stored, row in zip(self.result.per_frame, rows, strict=True):
             stored |= {name: float(value) for name, value in row.items() if math.isfinite(value)}

@@ -13,8 +13,7 @@ import socket
 import threading
 import urllib.request
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -28,10 +27,8 @@ from .score import ScoreUnavailable
 if TYPE_CHECKING:
     from torch import Tensor
 
-ENVIRONMENT_VARIABLE = "ENDOPRIOR_WEIGHTS"
-"""Environment variable that names a folder of weights."""
-NETWORK_TIMEOUT_S = 4.0
-"""Timeout of the download server, s; short, because many machines have no network."""
+ENVIRONMENT_VARIABLE = "ENDOPRIOR_WEIGHTS"  # Environment variable that names a folder of weights
+NETWORK_TIMEOUT_S = 4.0  # Timeout of the download server, s; short, because many machines have no network
 
 
 class WeightsMissing(ScoreUnavailable):
@@ -42,16 +39,12 @@ class WeightsMissing(ScoreUnavailable):
 class WeightFiles:
     """The files any of which holds the weights of one network, under torchvision's keys."""
 
-    network: str
-    """The network's name in messages."""
-    names: tuple[str, ...]
-    """File names to look for; the first match is used."""
-    url: str
-    """Address at which torchvision publishes them; the file name ends in the start of its SHA-256."""
+    network: str  # The network's name in messages
+    names: tuple[str, ...]  # File names to look for: ours of safetensors, and torchvision's; the first match is used
+    url: str  # Address at which torchvision publishes them; the file name ends in the start of its SHA-256
 
 
 def _published(network: str, folder_name: str, url_name: str) -> WeightFiles:
-    """The file names of one network: ours for a folder of safetensors, and torchvision's."""
     return WeightFiles(network, (folder_name, url_name), f"https://download.pytorch.org/models/{url_name}")
 
 
@@ -63,36 +56,29 @@ SQUEEZENET = _published("SqueezeNet 1.1", "squeezenet1_1_features.safetensors", 
 
 
 def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, download: bool = True) -> Path:
-    """Find the weights of a network; the module lists the places.
-
-    Args:
-        weights_dir: a folder to look in first.
-        download: False never touches the network.
-    Raises:
-        InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
-        WeightsMissing: the file is in none of the places and could not be downloaded, with the reason.
+    """Find the weights of a network in the places that the module lists; `download=False` never touches the network.
+    InputError for a named folder that is none; WeightsMissing says what was tried.
     """
     import torch
 
     cache = Path(torch.hub.get_dir()) / "checkpoints"  # where torch keeps downloaded weights
-    places: list[tuple[str, Path]] = []
-    if weights_dir is not None:
-        places.append(("weights folder", _existing_folder("--weights-dir", Path(weights_dir))))
-    if named := os.environ.get(ENVIRONMENT_VARIABLE):
-        places.append((ENVIRONMENT_VARIABLE, _existing_folder(ENVIRONMENT_VARIABLE, Path(named))))
-    places.append(("torch cache", cache))
-    for file in (folder / name for _, folder in places for name in files.names):
+    named = {"--weights-dir": weights_dir, ENVIRONMENT_VARIABLE: os.environ.get(ENVIRONMENT_VARIABLE) or None}
+    places = {source: Path(folder) for source, folder in named.items() if folder is not None}
+    for source, folder in places.items():
+        if not folder.is_dir():
+            raise input_error(source, "a folder of network weights", f"{folder}, which is not one", "check the path.")
+    places["torch cache"] = cache
+    for file in (folder / name for folder in places.values() for name in files.names):
         if file.is_file():
             return file
+    tried = "downloads are off"
     if download:
         target = cache / files.url.rsplit("/", 1)[-1]
         failure = _download(files.url, target)
         if failure is None:
             return target
         tried = f"the download of {files.url} failed ({failure})"
-    else:
-        tried = "downloads are off"
-    searched = ", ".join(f"{source} {folder}" for source, folder in places)
+    searched = ", ".join(f"{source} {folder}" for source, folder in places.items())
     raise WeightsMissing(
         f"no weights for {files.network}: expected {' or '.join(files.names)} in {searched}; {tried}. "
         f"Fix: Put the file in a folder and name it with --weights-dir or {ENVIRONMENT_VARIABLE}."
@@ -100,11 +86,7 @@ def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, downloa
 
 
 def load_weights(file: Path) -> Mapping[str, Tensor]:
-    """Read named tensors from a `.safetensors` or `.pth` file; a `.pth` may contain data only.
-
-    Raises:
-        WeightsMissing: the file cannot be read or holds no named tensors, with the reason.
-    """
+    """Named tensors of a `.safetensors` or `.pth` file, which may contain data only; else WeightsMissing says why."""
     import torch
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -126,13 +108,8 @@ def load_weights(file: Path) -> Mapping[str, Tensor]:
 
 
 def select_weights(file: Path, keys: Mapping[str, Tensor], origin: Mapping[str, str]) -> dict[str, Tensor]:
-    """The tensors a network needs, selected from a weights file by name and checked for shape.
-
-    Args:
-        keys: the network's own state: name -> tensor of the right shape.
-        origin: name in the network -> name in the file, of all that is wanted.
-    Raises:
-        WeightsMissing: the file cannot be read, lacks a name, or holds another shape under it.
+    """The tensors a network needs, from a weights file: `origin` gives the name in the file by the name in the network,
+    `keys` a tensor of the right shape. WeightsMissing where one is not there.
     """
     stored = load_weights(file)
     selected = {}
@@ -148,13 +125,6 @@ def select_weights(file: Path, keys: Mapping[str, Tensor], origin: Mapping[str, 
     return selected
 
 
-def _existing_folder(name: str, folder: Path) -> Path:
-    """The folder itself, or InputError naming the option that gave it."""
-    if not folder.is_dir():
-        raise input_error(name, "a folder of network weights", f"{folder}, which is not one", "check the path.")
-    return folder
-
-
 def _download(url: str, target: Path) -> str | None:
     """Download a published file into torch's cache and check the hash in its name; None, or why it failed."""
     import torch
@@ -162,12 +132,15 @@ def _download(url: str, target: Path) -> str | None:
     if failure := _unreachable(url):
         return failure
     digest = re.search(r"-([0-9a-f]{8,})\.", target.name)
+    before = socket.getdefaulttimeout()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with _socket_timeout(NETWORK_TIMEOUT_S):
-            torch.hub.download_url_to_file(url, str(target), digest and digest.group(1), progress=False)
+        socket.setdefaulttimeout(NETWORK_TIMEOUT_S)  # torch's download has none of its own
+        torch.hub.download_url_to_file(url, str(target), digest and digest.group(1), progress=False)
     except (OSError, RuntimeError) as error:
         return _first_line(error)
+    finally:
+        socket.setdefaulttimeout(before)
     return None
 
 
@@ -189,19 +162,7 @@ def _unreachable(url: str) -> str | None:
     return outcome[0] if outcome else f"no answer within {NETWORK_TIMEOUT_S:g} s"
 
 
-@contextmanager
-def _socket_timeout(seconds: float) -> Iterator[None]:
-    """Set the timeout of new sockets: torch's download has none of its own."""
-    before = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(seconds)
-    try:
-        yield
-    finally:
-        socket.setdefaulttimeout(before)
-
-
 def _first_line(error: BaseException) -> str:
-    """The first line of an error."""
     text = str(error).strip()
     return text.splitlines()[0] if text else type(error).__name__
 
@@ -215,14 +176,11 @@ _declared: list[Any] = []  # torch drops the declarations when the library objec
 
 
 def import_torchvision() -> ModuleType:
-    """The torchvision module. Only this function and the lpips package import it.
+    """The torchvision module; ScoreUnavailable without. Only this function and the lpips package import it.
 
     A CUDA build of torchvision with a CPU-only torch cannot load its compiled operators, and its import then fails with
     "operator torchvision::nms does not exist". RAFT and the classifiers use none of them: two names are declared, and
     it is imported again.
-
-    Raises:
-        ScoreUnavailable: torchvision is not installed, or does not work with this torch.
     """
     import torch
 

@@ -36,16 +36,13 @@ class Pictures:
         depth_scale: float | None = None,
         name: str = "",
     ) -> None:
-        """Find the file of every frame; they are decoded when they are used.
+        """Find the file of every frame, or raise InputError; they are decoded when they are used.
 
         Args:
             folder: RGB images of 8 or 16 bits, of the size of the sequence's frames.
             split: frames that must be there; scores that need others are skipped if these are not.
-            depth_folder: NPY files in mm, or 16-bit PNG files.
-            depth_scale: mm per unit of the depth files; PNG files need it.
+            depth_folder: NPY files in mm, or 16-bit PNG files, which need `depth_scale`, mm per unit.
             name: of the method, for `metrics.json`; default: the folder's.
-        Raises:
-            InputError: no such folder, files that do not match the frames, or PNG depth without a scale.
         """
         self._sequence, self._scale = sequence, depth_scale
         self._color, rule = _matched(folder, (".png",), sequence, split)
@@ -67,19 +64,15 @@ class Pictures:
     def remarks(self) -> list[str]:
         """How files and frames were matched, one line for each folder."""
         facts, total = self.provenance["pictures"], len(self._sequence)
-        lines = [f"{facts['folder']}: {len(self._color)} of {total} frames, {facts['matched_by']}"]
-        if self._depth:
-            rule = facts["depth_matched_by"]
-            lines.append(f"{facts['depth_folder']}: {len(self._depth)} of {total} frames, {rule}")
-        return lines
+        folders = {"": self._color, "depth_": self._depth}
+        return [
+            f"{facts[kind + 'folder']}: {len(files)} of {total} frames, {facts[kind + 'matched_by']}"
+            for kind, files in folders.items()
+            if files
+        ]
 
     def render(self, index: int) -> Rendering:
-        """See `Reconstruction.render`.
-
-        Raises:
-            InputError: a file cannot be used, or has another size than the frames.
-            ScoreUnavailable: there is no image of this frame.
-        """
+        """See `Reconstruction.render`; InputError for a file that cannot be used."""
         if index not in self._color:
             raise ScoreUnavailable(f"needs more frames: there is no image of frame {index}")
         camera, depth = self._sequence.camera(index), self._depth.get(index)
@@ -97,10 +90,8 @@ def fingerprint(folder: Path, suffixes: tuple[str, ...] = (".png", ".npy")) -> s
 def frames_of_files(
     folder: Path, files: Sequence[Path], sequence: FrameSequence, required: Sequence[int]
 ) -> tuple[dict[int, Path], str]:
-    """The file of each frame that has one, and the rule that says so.
-
-    Raises:
-        InputError: a required frame has no file, or a file belongs to no frame: it would then count frames otherwise.
+    """The file of each frame that has one, and the rule that says so. InputError where a required frame has no file, or
+    a file belongs to no frame: it would then count frames otherwise.
     """
     names = [file.name for file in files]
     match = match_names(folder, names, range(len(sequence)), sequence.image_names, required=required)
@@ -114,7 +105,6 @@ def frames_of_files(
 def _matched(
     folder: Path, suffixes: tuple[str, ...], sequence: FrameSequence, split: Split
 ) -> tuple[dict[int, Path], str]:
-    """The file of each frame, and the rule that says so."""
     if (kind := kind_of(folder)) != "a folder":
         raise input_error(folder, "a folder of rendered frames", kind, "correct the path.")
     files = files_with(folder, suffixes)

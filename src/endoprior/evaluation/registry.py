@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from ..system.plugins import Registry, report
 from .score import Score
@@ -34,11 +34,7 @@ class Scorer(Protocol):
     SCORES: tuple[Score, ...]
 
     def compute(self, context: EvaluationContext) -> None:
-        """Record every score, or why it has no value.
-
-        Raises:
-            ScoreUnavailable: none of them has one; recorded as the reason of each.
-        """
+        """Record every score, or why it has no value; ScoreUnavailable is the reason of each without one."""
         ...
 
 
@@ -53,7 +49,7 @@ def _problem(found: Any) -> str:
 
 
 def _builtin(name: str) -> Scorer:
-    return import_module(f".scorers.{name}", __package__)
+    return cast(Scorer, import_module(f".scorers.{name}", __package__))  # a module as an instance of the protocol
 
 
 REGISTRY: Registry[Scorer] = Registry(
@@ -85,5 +81,7 @@ def all_scores() -> dict[str, Score]:
 
 
 def _builtin_scores() -> dict[str, Score]:
-    modules = [*map(_builtin, SCORERS), import_module(".mask_scores", __package__)]
-    return {score.name: score for module in modules for score in module.SCORES}
+    of_masks = import_module(".true_masks", __package__).SCORES
+    return {
+        score.name: score for scores in (*(_builtin(name).SCORES for name in SCORERS), of_masks) for score in scores
+    }

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
 from ..core.geometry import length_unit
 
 Group = Literal["image", "depth", "motion", "model", "speed", "masks", "other"]
-GROUPS: tuple[Group, ...] = get_args(Group)
-"""What a score is about, in the order of the printed table."""
+GROUPS: tuple[Group, ...] = get_args(Group)  # What a score is about, in the order of the printed table
 
 
 class ScoreUnavailable(RuntimeError):
@@ -20,10 +19,8 @@ class ScoreUnavailable(RuntimeError):
 
 
 def mean_over_frames(values: Iterable[float]) -> float:
-    """Mean of the finite values; NaN when there is none.
-
-    NaN marks a frame on which the score is undefined (no tissue, no depth, no tool). Infinity is the PSNR of two equal
-    images; it is ignored too, because one such frame would hide all others.
+    """Mean of the finite values; NaN when there is none. NaN marks a frame on which the score is undefined (no tissue,
+    no depth, no tool). Infinity is the PSNR of two equal images: one such frame would hide all others.
     """
     array = np.asarray(list(values), dtype=np.float64)
     finite = array[np.isfinite(array)]
@@ -67,8 +64,7 @@ class Score:
 
     def heading(self, relative: bool = False) -> str:
         """Label and unit: `tissue PSNR, dB`."""
-        unit = self.shown_unit(relative)
-        return f"{self.label}, {unit}" if unit else self.label
+        return f"{self.label}, {self.shown_unit(relative)}".removesuffix(", ")
 
     @property
     def arrow(self) -> str:
@@ -78,3 +74,21 @@ class Score:
     def text(self, value: float, relative: bool = False) -> str:
         """A value with its unit: `31.27 dB`."""
         return f"{value:,.{self.digits}f} {self.shown_unit(relative)}".rstrip()
+
+
+def scores_from(table: str) -> tuple[Score, ...]:
+    """Scores from a table of two lines each: its columns, and the description.
+
+    The columns are `name | label | unit | higher, lower or - | digits | absolute or relative | group | hint`. The unit
+    `true mm` is mm of the ground truth; a score whose hint is `-` is not printed in summaries.
+    """
+    lines = [line.strip() for line in table.strip().splitlines()]
+    scores = []
+    for columns, description in zip(lines[::2], lines[1::2], strict=True):
+        name, label, unit, better, digits, compare, group, hint = (column.strip() for column in columns.split("|"))
+        assert compare in ("absolute", "relative") and group in GROUPS, columns
+        is_printed, is_true = hint != "-", unit.startswith("true ")
+        higher, unit = {"higher": True, "lower": False, "-": None}[better], unit.removeprefix("true ")
+        about = (cast(Any, compare), cast(Group, group), hint if is_printed else "", is_printed, is_true)
+        scores.append(Score(name, label, unit, higher, int(digits), description, *about))
+    return tuple(scores)

@@ -21,7 +21,7 @@ from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext, Reconstruction, SceneFrames
 from .protocols.compute import score_protocols, tags_of
 from .protocols.table import OURS
-from .registry import REGISTRY, SCORERS, Scorer, scorers
+from .registry import REGISTRY, SCORERS, scorers
 from .score import ScoreUnavailable
 from .scorers.model import FPS_RENDERS, LONGEST_SECONDS
 
@@ -51,36 +51,33 @@ def evaluate(
     Raises:
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
     """
-    is_scene = isinstance(scene, RenderedScene)
-    if is_scene and len(sequence) != len(scene.cameras):
-        frames = f"the {len(scene.cameras)} frames the scene was trained on"
-        raise input_error(sequence.path, frames, str(len(sequence)), "pass the same sequence.")
-    if is_scene:  # the poses in which it was trained, which may have been estimated again since
-        sequence = sequence.with_poses(scene.cameras)
-    reading = reading or (scene.config.data if is_scene else DataConfig())
-    result = Evaluation(_protocol(sequence, split, reading))
-    if is_scene:
-        result.protocol |= _rendering(scene)
+    rendering: dict[str, str] = {}
+    if isinstance(scene, RenderedScene):
+        if len(sequence) != len(scene.cameras):
+            expected = f"the {len(scene.cameras)} frames the scene was trained on"
+            raise input_error(sequence.path, expected, str(len(sequence)), "pass the same sequence.")
+        sequence = sequence.with_poses(scene.cameras)  # in which it was trained; they may have been estimated again
+        frames, reading = SceneFrames(scene, sequence), reading or scene.config.data
+        fps = f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
+        rendering = {"backend": scene.backend, "fps": f"{fps}{LONGEST_SECONDS:g} s; {name_of(scene.device)}"}
+    else:
+        frames = scene
+    reading = reading or DataConfig()
+    result = Evaluation(_protocol(sequence, split, reading) | rendering)
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
-    frames = SceneFrames(scene, sequence) if is_scene else scene
     context = EvaluationContext(frames, sequence, split, networks, weights_dir, result, given_path)
     for name, scorer in scorers().items():
         with context.skip_if_unavailable(*(score.name for score in scorer.SCORES)):
-            _compute(name, scorer, context)
+            try:
+                scorer.compute(context)
+            except Exception as error:  # in a plugin it costs the plugin's scores only
+                if name in SCORERS or isinstance(error, ScoreUnavailable):
+                    raise
+                raise ScoreUnavailable(REGISTRY.failure(name, error)) from error
     result.protocol["tags"] = tags_of(OURS, context, sequence.indices(split), sequence.mask_folder, reading.shrink)
     result.protocols = score_protocols(protocols, context, scored_data(reading))
     return result
-
-
-def _compute(name: str, scorer: Scorer, context: EvaluationContext) -> None:
-    """Run a scorer. An error in a plugin costs its own scores only."""
-    try:
-        scorer.compute(context)
-    except Exception as error:
-        if name in SCORERS or isinstance(error, ScoreUnavailable):
-            raise
-        raise ScoreUnavailable(REGISTRY.failure(name, error)) from error
 
 
 def scored_data(trained: DataConfig) -> DataConfig:
@@ -107,12 +104,4 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "poses": "of the scene",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),
-    }
-
-
-def _rendering(scene: RenderedScene) -> dict[str, Any]:
-    return {
-        "backend": scene.backend,
-        "fps": f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
-        f"{LONGEST_SECONDS:g} s; {name_of(scene.device)}",
     }

@@ -43,56 +43,38 @@ def rotated(splats: Splats, rotation: NDArray[np.float64]) -> Splats:
     if np.array_equal(rotation, np.eye(3)):
         return splats
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    matrix = torch.from_numpy(rotation)
+    matrix, turn = torch.from_numpy(rotation), _sh_rotation(harmonics.degree_of(splats.sh.shape[1]), rotation.tobytes())
     return Splats(
         means=(splats.means.double() @ matrix.T).to(splats.means.dtype),
         quats=_quaternion_product(torch.tensor([w, x, y, z]), splats.quats.double()).to(splats.quats.dtype),
         scales=splats.scales,
         opacities=splats.opacities,
-        sh=_rotated_sh(splats.sh, rotation),
+        sh=torch.einsum("kj,njc->nkc", torch.from_numpy(turn), splats.sh.double()).to(splats.sh.dtype),
         color_slopes=splats.color_slopes,
     )
 
 
 def _quaternion_product(left: Tensor, right: Tensor) -> Tensor:
-    """Hamilton product of quaternions (w, x, y, z), shapes (..., 4): the rotation `right`, then `left`."""
+    """Hamilton product of quaternions (w, x, y, z), shapes (4,) and (N, 4): the rotation `right`, then `left`."""
     a, b, c, d = left.unbind(-1)
     w, x, y, z = right.unbind(-1)
-    return torch.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ],
-        -1,
-    )
-
-
-def _rotated_sh(sh: Tensor, rotation: NDArray[np.float64]) -> Tensor:
-    """Coefficients (N, K, 3) rotated with their Gaussians: the color from direction d becomes that from R d."""
-    matrix = torch.from_numpy(_sh_rotation(harmonics.degree_of(sh.shape[1]), rotation.tobytes()))
-    return torch.einsum("kj,njc->nkc", matrix, sh.double()).to(sh.dtype)
+    real, i = a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y
+    return torch.stack([real, i, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w], -1)
 
 
 @cache
 def _sh_rotation(degree: int, rotation: bytes) -> NDArray[np.float64]:
-    """(K, K) matrix that rotates spherical-harmonic coefficients up to `degree`.
+    """(K, K) matrix that rotates harmonics up to `degree` by a (3, 3) matrix of float64, given as bytes.
 
     Degrees do not mix. The block of each solves Y(R d) block = Y(d) by least squares over directions d on a spiral,
     more of them than unknowns; the equations have an exact solution.
-
-    Args:
-        rotation: (3, 3) float64 as bytes.
     """
     k = np.arange(64)
     height, angle = 1 - (2 * k + 1) / 64, k * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - height**2)
     directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
-    rotated_directions = directions @ np.frombuffer(rotation).reshape(3, 3).T
-    before, after = (
-        harmonics.basis(torch.from_numpy(d.copy()), degree).numpy() for d in (directions, rotated_directions)
-    )
+    turned = directions @ np.frombuffer(rotation).reshape(3, 3).T
+    before, after = (harmonics.basis(torch.from_numpy(d.copy()), degree).numpy() for d in (directions, turned))
     matrix = np.zeros(((degree + 1) ** 2,) * 2)
     for band in range(degree + 1):
         own = slice(band**2, (band + 1) ** 2)

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
 from ..core.geometry import length_unit
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import REGISTRY, ExportOptions, Format, Progress, formats_of, load_format, usable_formats
+from .formats import REGISTRY, ExportOptions, Files, Format, Progress, formats_of, load_format, usable_formats
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
 
 
-def export(
-    scene: Scene, out: Path, options: ExportOptions, progress: Progress = lambda done, total: None
-) -> list[Path]:
-    """Write `scene` in the format that `options` names.
+def format_name(out: Path, options: ExportOptions) -> str:
+    """The format that `options` name, else the first one of `out`'s suffix; InputError if neither names one."""
+    if name := options.format or next(iter(formats_of(out.suffix)), None):
+        return name
+    got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
+    known = dict.fromkeys(suffix for each in usable_formats().values() for suffix in each.suffixes)
+    fix = f"Choose a suffix of {' '.join(known)}, or add --format with one of {', '.join(REGISTRY.names())}."
+    raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
+
+
+def export(scene: Scene, out: Path, options: ExportOptions, progress: Progress = lambda *_: None) -> list[Path]:
+    """Write `scene` in the format that `options` names, whole or not at all.
 
     Args:
         out: a file if its suffix is the format's, else a new or empty folder.
@@ -30,70 +37,52 @@ def export(
             `out` does not suit it; or there is nothing to write.
     """
     name = format_name(out, options)
-    options, chosen = replace(options, format=name), load_format(name)
-    _reject_unused_options(options, chosen)
-    options = replace(options, frame=options.frame or chosen.default_axes)
-    if chosen.suffix_option:
-        options = replace(options, **{chosen.suffix_option: _by_suffix(out, options, chosen)})
-    if chosen.write:
-        _check_file(out, chosen.suffixes, name)
-        chosen.write(scene, out, options, progress)
-    else:
-        _export_time_steps(scene, out, options, chosen, progress)
-    return [out]
-
-
-def format_name(out: Path, options: ExportOptions) -> str:
-    """The format that `options` name, else the first one of `out`'s suffix.
-
-    Raises:
-        InputError: neither names one.
-    """
-    name = options.format or next(iter(formats_of(out.suffix)), None)
-    if name is None:
-        got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
-        known = dict.fromkeys(suffix for each in usable_formats().values() for suffix in each.suffixes)
-        fix = f"Choose a suffix of {' '.join(known)}, or add --format with one of "
-        fix += f"{', '.join(REGISTRY.names())}."
-        raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
-    return name
-
-
-def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:
-    """The value of the option that chooses between the format's suffixes: as given, else as the file is named.
-
-    Raises:
-        InputError: both are given, and differ.
-    """
-    given, option = getattr(options, chosen.suffix_option), chosen.suffix_option.replace("_", "-")
-    named = out.suffix.removeprefix(".") if out.suffix in chosen.suffixes else None
-    if given and named and given != named:
-        raise input_error(f"--{option} {given}", f"a file that ends in .{given}", str(out), f"Remove --{option}.")
-    return given or named or chosen.suffixes[0].removeprefix(".")
-
-
-def _reject_unused_options(options: ExportOptions, chosen: Format) -> None:
+    chosen = load_format(name)
     for field in fields(options):
         given = getattr(options, field.name) != field.default
         if given and field.name not in ("format", *chosen.options):
-            known = ", ".join(f"--{name.replace('_', '-')}" for name in chosen.options) or "no options"
-            want, fix = f"an option of --format {options.format}", f"Leave it out. The format takes {known}."
-            raise input_error(f"--{field.name.replace('_', '-')}", want, "one that it does not use", fix)
+            known = ", ".join(map(_option, chosen.options)) or "no options"
+            want, fix = f"an option of --format {name}", f"Leave it out. The format takes {known}."
+            raise input_error(_option(field.name), want, "one that it does not use", fix)
+    options = replace(options, format=name, frame=options.frame or chosen.default_axes)
+    if chosen.suffix_option:
+        options = replace(options, **{chosen.suffix_option: _by_suffix(out, options, chosen)})
+    if chosen.files is not None:
+        _write_time_steps(scene, out, options, chosen, chosen.files, progress)
+    elif chosen.write is not None:
+        _check_file(out, chosen.suffixes, name)
+        chosen.write(scene, out, options, progress)
+    return [out]
 
 
-def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: Format, progress: Progress) -> None:
-    from .time_steps import selected_time_steps
+def _option(field: str) -> str:
+    return f"--{field.replace('_', '-')}"
 
-    steps = selected_time_steps(scene, options)
+
+def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:
+    """The value of the option that chooses between the format's suffixes: as given, else as the file is named."""
+    given, option = getattr(options, chosen.suffix_option), _option(chosen.suffix_option)
+    named = out.suffix.removeprefix(".") if out.suffix in chosen.suffixes else None
+    if given and named and given != named:
+        raise input_error(f"{option} {given}", f"a file that ends in .{given}", str(out), f"Remove {option}.")
+    return given or named or chosen.suffixes[0].removeprefix(".")
+
+
+def _write_time_steps(
+    scene: Scene, out: Path, options: ExportOptions, chosen: Format, files: Files, progress: Progress
+) -> None:
+    from .time_steps import selected_time_steps  # which takes long to import
+
+    steps, name = selected_time_steps(scene, options), str(options.format)
     if same_suffix := formats_of(out.suffix):
-        _check_file(out, chosen.suffixes, options.format)
+        _check_file(out, chosen.suffixes, name)
         if len(steps) != 1:
-            moving = [name for name in same_suffix if load_format(name).write]
-            instead = "".join(f", or --format {each} for all of them" for each in moving)
+            moving = [other for other in same_suffix if load_format(other).write]
+            instead = "".join(f", or --format {other} for all of them" for other in moving)
             fix = f"Pass --times T with T in [0, 1], or a folder instead of a file{instead}."
             raise input_error(out, "one time step for one file", f"{len(steps)}", fix)
-        contents = chosen.files(scene, steps[0], options)
-        _check_file(out, tuple(contents), options.format)
+        contents = files(scene, steps[0], options)
+        _check_file(out, tuple(contents), name)
         with whole_file(out) as temporary:
             temporary.write_bytes(contents[out.suffix])
         progress(1, 1)
@@ -101,17 +90,16 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
     with whole_folder(out) as folder:
         written = []
         for k, step in enumerate(steps):
-            contents = chosen.files(scene, step, options)
-            for suffix, content in contents.items():
-                (folder / f"{step.name}{suffix}").write_bytes(content)
-            written.append({"files": [f"{step.name}{suffix}" for suffix in contents], **step.facts()})
+            contents = {f"{step.name}{suffix}": each for suffix, each in files(scene, step, options).items()}
+            for file, content in contents.items():
+                (folder / file).write_bytes(content)
+            written.append({"files": list(contents), **step.facts()})
             progress(k + 1, len(steps))
-        if not chosen.has_index:
-            return
-        relative = scene.lengths_are_relative
-        units: Mapping[str, Any] = chosen.index_facts or {"axes": options.frame, "unit": length_unit(relative)}
-        facts = {"lengths_are_relative": relative, "frames_per_second": scene.frames_per_second}
-        write_json(folder / "index.json", {"format": options.format, **units, **facts, "time_steps": written})
+        if chosen.has_index:
+            relative = scene.lengths_are_relative
+            units = chosen.index_facts or {"axes": options.axes, "unit": length_unit(relative)}
+            facts = {"lengths_are_relative": relative, "frames_per_second": scene.frames_per_second}
+            write_json(folder / "index.json", {"format": name, **units, **facts, "time_steps": written})
 
 
 def _check_file(out: Path, suffixes: tuple[str, ...], name: str) -> None:
@@ -123,6 +111,5 @@ def _check_file(out: Path, suffixes: tuple[str, ...], name: str) -> None:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise input_error(
-            out, "a place where a file can be written", f"{error.strerror}", "Choose another place."
-        ) from error
+        want = "a place where a file can be written"
+        raise input_error(out, want, f"{error.strerror}", "Choose another place.") from error

@@ -21,6 +21,7 @@ Axes = Literal["opencv", "opengl", "ras", "lps"]
 """Axes that exported coordinates refer to; docs/format.md defines them."""
 Progress = Callable[[int, int], None]
 """Takes how much is done and how much there is."""
+Files = Callable[["Scene", Any, "ExportOptions"], dict[str, bytes]]
 
 FORMATS = {
     "ply": "ply:PLY",
@@ -54,7 +55,7 @@ class Format:
     """Suffixes of its files; empty for a `write` that makes a folder."""
     options: tuple[str, ...]
     """Fields of `ExportOptions` that the format uses; others are rejected."""
-    files: Callable[[Scene, Any, ExportOptions], dict[str, bytes]] | None = None
+    files: Files | None = None
     """The contents of the files of one `time_steps.TimeStep`, by suffix."""
     write: Callable[[Scene, Path, ExportOptions, Progress], None] | None = None
     """Writes one output for the whole sequence."""
@@ -88,13 +89,23 @@ REGISTRY: Registry[Format] = Registry(
     "exporters", "a Format of endoprior.export.formats", _problem, modules=tuple(FORMATS), load_module=_built_in
 )
 """The formats above, and those of plugins."""
+RANGES = {
+    "min_alpha": (0.01, 1),
+    "min_opacity": (0, 1),
+    "mesh_step": (1, 1000),
+    "max_slope": (0.01, 1000),
+    "voxel_mm": (0.01, 1000),
+    "grid_px": (1, 100_000),
+    "max_mb": (0.1, 1000),
+}
+"""The least and the largest value of options."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """Options of an export. Each format takes some of them and rejects the others."""
 
-    format: Literal[REGISTRY.names()] | None = None
+    format: Literal[REGISTRY.names()] | None = None  # pyright: ignore[reportInvalidTypeForm]
     """Format; by default the one of OUT's suffix: .ply and .glb are Gaussians, .obj is a mesh.
     Blender opens `animation` (a moving mesh, .glb) and `mesh`. A folder has no default."""
     times: tuple[float, ...] = ()
@@ -140,13 +151,13 @@ class ExportOptions:
     def __post_init__(self) -> None:
         for time in self.times:
             check_range("times", time, 0, 1)
-        check_range("min_alpha", self.min_alpha, 0.01, 1)
-        check_range("min_opacity", self.min_opacity, 0, 1)
-        check_range("mesh_step", self.mesh_step, 1, 1000)
-        check_range("max_slope", self.max_slope, 0.01, 1000)
-        check_range("voxel_mm", self.voxel_mm, 0.01, 1000)
-        check_range("grid_px", self.grid_px, 1, 100_000)
-        check_range("max_mb", self.max_mb, 0.1, 1000)
+        for name, (low, high) in RANGES.items():
+            check_range(name, getattr(self, name), low, high)
+
+    @property
+    def axes(self) -> Axes:
+        """`frame`; `export` has put the format's default in the place of None."""
+        return self.frame or "opencv"
 
 
 def load_format(name: str) -> Format:

@@ -36,8 +36,7 @@ def depth(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
 def depth_png(depth: NDArray[np.float32]) -> bytes:
     """A 16-bit gray PNG of (H, W) depth, mm; what is deeper than 655.35 mm does not fit and becomes 0, missing."""
     steps = np.rint(depth * np.float32(PNG_STEPS_PER_MM))
-    fits = (steps > 0) & (steps <= 65535)
-    return encode_png(np.where(fits, steps, 0).astype(np.uint16))
+    return encode_png(np.where(steps <= 65535, steps, 0).astype(np.uint16))
 
 
 def write_cameras(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
@@ -47,24 +46,18 @@ def write_cameras(scene: Scene, out: Path, options: ExportOptions, progress: Pro
     it.
     """
     steps = selected_time_steps(scene, options)
-    write_json(out, [_entry(k, step.name, step.camera(scene), options.frame) for k, step in enumerate(steps)])
+    write_json(out, [_entry(k, step.name, step.camera(scene), options.axes) for k, step in enumerate(steps)])
     progress(1, 1)
 
 
 def _entry(number: int, name: str, camera: Camera, axes: Axes) -> dict[str, Any]:
     """Position (mm) and camera-to-world rotation of right, down, forward; px. 3DGS itself has no cx and cy."""
-    return {
-        "id": number,
-        "img_name": name,
-        "width": camera.width,
-        "height": camera.height,
+    pose = {
         "position": points_in_axes(camera.center, axes).tolist(),
         "rotation": points_in_axes(camera.world_to_camera[:3, :3], axes).T.tolist(),
-        "fy": camera.fy,
-        "fx": camera.fx,
-        "cx": camera.cx,
-        "cy": camera.cy,
     }
+    about = {"id": number, "img_name": name, "width": camera.width, "height": camera.height}
+    return about | pose | {name: getattr(camera, name) for name in ("fy", "fx", "cx", "cy")}
 
 
 def write_rendered(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
@@ -79,7 +72,7 @@ def write_rendered(scene: Scene, out: Path, options: ExportOptions, progress: Pr
     write_video(out, images(), scene.frames_per_second)
 
 
-def write_scene(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
+def write_scene(scene: Scene, out: Path, _options: ExportOptions, progress: Progress) -> None:
     """Write one safetensors file, of equal bytes to the run's own if this version wrote that; see docs/format.md.
 
     For a scene of several windows, whose files stand side by side, a folder `out` with those of a run folder.

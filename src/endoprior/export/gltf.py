@@ -25,10 +25,9 @@ from ..system.atomic import whole_file
 from .axes import points_in_axes
 from .formats import TIME_STEP_OPTIONS, ExportOptions, Format, Progress
 from .mesh import SURFACE_OPTIONS, surface_mesh
-from .ply import unit_quaternions
+from .ply import GAUSSIAN_OPTIONS, unit_quaternions
 from .time_steps import TimeStep, seconds_of_motion, selected_time_steps
 
-MM_TO_METERS = [0.001] * 3
 SPLATTING = "KHR_gaussian_splatting"
 UNLIT = "KHR_materials_unlit"
 """Vertex colors are those of the video, the endoscope's light included; viewers must not light them again."""
@@ -50,7 +49,7 @@ class Buffer:
         """Append float32 or uint32 `values`, (count,) or (count, 3 or 4), and return the number of their accessor.
 
         Args:
-            target: VERTEX_BUFFER or INDEX_BUFFER; None for what is neither.
+            target: VERTEX_BUFFER, INDEX_BUFFER or neither.
             bounds: also store minimum and maximum, as positions and times of keyframes must.
         """
         columns = values.reshape(len(values), -1)
@@ -64,15 +63,22 @@ class Buffer:
         self._contents += values.tobytes()
         return len(self._accessors) - 1
 
-    def file(self, document: dict[str, Any], extras: dict[str, Any]) -> bytes:
+    def file(
+        self, extension: str, node: dict[str, Any], mesh: dict[str, Any], extras: dict[str, Any], **document: Any
+    ) -> bytes:
         """The bytes of a .glb file: a header, a JSON chunk and a binary chunk, both padded to 4 bytes.
 
         Args:
-            document: its scene of one node, without `asset`, `accessors`, `bufferViews` and `buffers`.
-            extras: `extras` of its `asset`.
+            extension: which readers should know. node, mesh: the only ones, in mm.
+            extras: `extras` of its `asset`. document: what else it holds.
         """
         document = {
             "asset": {"version": "2.0", "generator": "endoprior", "extras": extras},
+            "extensionsUsed": [extension],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [node | {"mesh": 0, "scale": [0.001] * 3}],
+            "meshes": [mesh],
             **document,
             "accessors": self._accessors,
             "bufferViews": self._views,
@@ -96,31 +102,13 @@ def decoded_srgb(encoded: NDArray) -> NDArray:
 
 def gaussians(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The .glb file of one time step."""
-    extras = {"unit": length_unit(scene.lengths_are_relative), "axes": options.frame, "time": step.time}
-    return {".glb": encode_glb(step.plain_splats(scene, options.frame), extras)}
+    unit = length_unit(scene.lengths_are_relative)
+    extras = {"unit": unit, "axes": options.axes, "time": step.facts()["time"]}
+    return {".glb": encode_glb(step.plain_splats(scene, options.axes), extras)}
 
 
-def encode_glb(splats: Splats, extras: dict[str, Any] | None = None) -> bytes:
-    """One scene, one node, one primitive of POINTS. Args: extras: `extras` of the file's `asset`."""
-    buffer = Buffer()
-    numbers = {
-        name: buffer.add(np.ascontiguousarray(values, "<f4"), VERTEX_BUFFER, bounds=name == "POSITION")
-        for name, values in _attributes(splats).items()
-    }
-    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"attributes": numbers, "mode": _POINTS, "extensions": {SPLATTING: kernel}}
-    document = {
-        "extensionsUsed": [SPLATTING],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "scale": MM_TO_METERS}],
-        "meshes": [{"primitives": [primitive]}],
-    }
-    return buffer.file(document, extras or {})
-
-
-def _attributes(splats: Splats) -> dict[str, NDArray]:
-    """Vertex attributes by semantic: positions and scales in mm, the color of the fallback in linear light."""
+def encode_glb(splats: Splats, extras: dict[str, Any]) -> bytes:
+    """One primitive of POINTS: positions and scales in mm, the color of the fallback in linear light."""
     sh, opacities = splats.sh.numpy(), splats.opacities.numpy()
     attributes = {
         "POSITION": splats.means.numpy(),
@@ -132,7 +120,14 @@ def _attributes(splats: Splats) -> dict[str, NDArray]:
     for k in range(sh.shape[1]):
         band = int(np.sqrt(k))
         attributes[f"{SPLATTING}:SH_DEGREE_{band}_COEF_{k - band * band}"] = sh[:, k]
-    return attributes
+    buffer = Buffer()
+    numbers = {
+        name: buffer.add(np.ascontiguousarray(values, "<f4"), VERTEX_BUFFER, bounds=name == "POSITION")
+        for name, values in attributes.items()
+    }
+    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"attributes": numbers, "mode": _POINTS, "extensions": {SPLATTING: kernel}}
+    return buffer.file(SPLATTING, {}, {"primitives": [primitive]}, extras)
 
 
 # The moving mesh. Carried by the Gaussians, each vertex is one material point. Morph target i displaces every vertex to
@@ -149,8 +144,9 @@ def write_animation(scene: Scene, out: Path, options: ExportOptions, progress: P
     seconds = seconds_of_motion(scene, steps)
     mesh = surface_mesh(scene, steps[0], options)
     at_first = np.zeros(len(mesh.vertices), np.intp)
-    carried = carry_points(scene, mesh.vertices, at_first, [step.time for step in steps])
-    positions = points_in_axes(carried, options.frame)
+    positions = points_in_axes(
+        carry_points(scene, mesh.vertices, at_first, [step.time for step in steps]), options.axes
+    )
     buffer = Buffer()
     attributes = {
         "POSITION": buffer.add(positions[0], VERTEX_BUFFER, bounds=True),
@@ -166,20 +162,17 @@ def write_animation(scene: Scene, out: Path, options: ExportOptions, progress: P
     }
     channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
     primitive = {"attributes": attributes, "indices": indices, "targets": targets, "material": 0}
-    names = {"targetNames": [step.name for step in steps[1:]]}
-    document = {
-        "extensionsUsed": [UNLIT],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "tissue", "mesh": 0, "scale": MM_TO_METERS}],
-        "meshes": [{"name": "tissue", "primitives": [primitive], "extras": names}],
-        "materials": [{"name": "tissue", "doubleSided": True, "extensions": {UNLIT: {}}}],
-        "animations": [{"name": "motion", "samplers": [sampler], "channels": [channel]}],
-    }
-    relative = scene.lengths_are_relative
-    extras = {"unit": length_unit(relative), "axes": options.frame, "lengths_are_relative": relative}
+    names, relative = {"targetNames": [step.name for step in steps[1:]]}, scene.lengths_are_relative
+    content = buffer.file(
+        UNLIT,
+        {"name": "tissue"},
+        {"name": "tissue", "primitives": [primitive], "extras": names},
+        {"unit": length_unit(relative), "axes": options.axes, "lengths_are_relative": relative},
+        materials=[{"name": "tissue", "doubleSided": True, "extensions": {UNLIT: {}}}],
+        animations=[{"name": "motion", "samplers": [sampler], "channels": [channel]}],
+    )
     with whole_file(out) as temporary:
-        temporary.write_bytes(buffer.file(document, extras))
+        temporary.write_bytes(content)
     progress(1, 1)
 
 
@@ -193,13 +186,7 @@ def blender_note(scene: Scene, out: Path, options: ExportOptions) -> str:
     return f"a .glb file does not say which frames to play. In Blender's Python console, type: {code}"
 
 
-GAUSSIANS = Format(
-    suffixes=(".glb",),
-    options=(*TIME_STEP_OPTIONS, "canonical"),
-    files=gaussians,
-    default_axes="opengl",
-    holds="Gaussians",
-)
+GAUSSIANS = Format((".glb",), GAUSSIAN_OPTIONS, gaussians, default_axes="opengl", holds="Gaussians")
 ANIMATION = Format(
     suffixes=(".glb",),
     options=(*TIME_STEP_OPTIONS, *SURFACE_OPTIONS),

@@ -99,27 +99,27 @@ def write_html(
         times = [i / len(scene.cameras) for i in range(len(scene.cameras))]
     if not times or any(b <= a for a, b in pairwise(times)):
         raise input_error("times", "one or more increasing times", f"{times}", "list each time once.")
-    blocks, streams, num_shown, focus = [], [], np.zeros(len(times), int), {}
-    near, far = math.inf, 0.0
+    blocks, streams, num_shown, focus, depths = [], [], np.zeros(len(times), int), {}, []
     for block in quantized_blocks(scene, times):
         data, coded = pack(block.values)
         scaled = zip(block.low.tolist(), block.step.tolist(), coded, strict=True)
         channels = [{"low": low, "step": step, **stream} for low, step, stream in scaled]
         _, num_steps, num_gaussians = block.values.shape
+        stop = block.first + num_steps
         blocks.append({"first": block.first, "steps": num_steps, "gaussians": num_gaussians, "channels": channels})
         streams.append(data)
-        num_shown[block.steps] += num_gaussians
-        focus[(block.steps.start + block.steps.stop - 1) / 2] = block.focus
-        near, far = min(near, block.depth_range[0]), max(far, block.depth_range[1])
+        num_shown[block.first : stop] += num_gaussians
+        near, focus[(block.first + stop - 1) / 2], far = block.depths
+        depths += [near, far]
         size = 4 * math.ceil(sum(map(len, streams)) / 3)  # in Base64
         if size > max_bytes:
-            raise _too_large(out, max_bytes, size * len(times) / block.steps.stop, len(times), num_shown.max())
+            raise _too_large(out, max_bytes, size * len(times) / stop, len(times), num_shown.max())
     if not blocks:
         raise InputError(NOTHING_VISIBLE)
     about = _about(scene, times) | {
         "gaussians": int(num_shown.max()),
         "focus": np.interp(range(len(times)), list(focus), list(focus.values())).round(3).tolist(),
-        "depth_range": [near, far],
+        "depth_range": [min(depths), max(depths)],
         "channels": CHANNELS,
         "blocks": blocks,
     }
@@ -172,26 +172,18 @@ def _page(title: str, unit: str, about: dict[str, Any], data: bytes) -> str:
 
 # The data.
 
-CHANNELS = (
-    *("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity"),
-    *("r", "g", "b", "r1", "g1", "b1", "r2", "g2", "b2"),
-)
+CHANNELS = ("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity", "r", "g", "b")
+CHANNELS += ("r1", "g1", "b1", "r2", "g2", "b2")
 OPACITY = CHANNELS.index("opacity")
 LARGEST = 65535
 """Largest stored integer."""
-MAX_STEP_MM = 0.1
-"""Centers are off by half a step: never by more than 0.05 mm ..."""
-STEP_PX = 0.25
-"""... nor, at the working distance, by more than an eighth of a pixel on each axis."""
-QUAT_STEP = 1 / 255
-"""Of a component of the unit quaternion; turns a Gaussian by less than half a degree."""
-LOG_SCALE_STEP = 0.02
-"""A scale is off by at most 1 %."""
+MAX_STEP_MM, STEP_PX = 0.1, 0.25
+"""Centers are off by half a step: never by more than 0.05 mm, nor, at the working distance, by more than an eighth of a
+pixel on each axis."""
+QUAT_STEP, LOG_SCALE_STEP, OPACITY_STEP, COLOR_STEP, SLOPE_STEP = 1 / 255, 0.02, 1 / 1020, 1 / 255, 1 / 510
+"""A component of the unit quaternion turns a Gaussian by less than half a degree; a scale is off by at most 1 %."""
 SMALLEST_SCALE_PX = 0.02
 """Scales below this at the working distance are stored as this: the renderer's blur is 27 times wider."""
-OPACITY_STEP = 1 / 1020
-COLOR_STEP = 1 / 255
-SLOPE_STEP = 1 / 510
 LARGEST_SLOPE = 8
 """A color would change by its whole range within an eighth of a standard deviation."""
 
@@ -208,15 +200,9 @@ class Block:
     """(C,) what q = 0 stands for."""
     step: NDArray[np.float64]
     """(C,)."""
-    depth_range: tuple[float, float]
-    """1st and 99th percentile of z of the visible Gaussians, at least 1 % apart, mm."""
-    focus: float
-    """Median z, mm: a free view turns around a point at this depth."""
-
-    @property
-    def steps(self) -> range:
-        """The time steps that show it."""
-        return range(self.first, self.first + self.values.shape[1])
+    depths: tuple[float, float, float]
+    """1st, 50th and 99th percentile of z of the visible Gaussians, mm, the outer at least 1 % apart; a free view turns
+    around a point at the median."""
 
 
 def quantized_blocks(scene: Scene, times: list[float]) -> Iterator[Block]:
@@ -246,20 +232,18 @@ def quantized_blocks(scene: Scene, times: list[float]) -> Iterator[Block]:
 
 
 def _quantize(raw: NDArray[np.float32], depths: NDArray[np.float32], first: int, focal: float) -> Block | None:
-    """Args: as `_sample` returns them; `raw` is changed. None: nothing is visible."""
-    opacity = raw[OPACITY]
-    finite = np.isfinite(raw).all(0)
-    visible_depths = depths[finite & (depths > NEAR_Z) & (opacity >= ALPHA_MIN)]
+    """The block of what `_sample` returns, which is changed; None: nothing is visible."""
+    finite, opaque = np.isfinite(raw).all(0), raw[OPACITY] >= ALPHA_MIN
+    visible_depths = depths[finite & (depths > NEAR_Z) & opaque]
     if not len(visible_depths):
         return None
     near, focus, far = (float(v) for v in np.percentile(visible_depths, [1, 50, 99]))
     steps = min(MAX_STEP_MM, STEP_PX * near / focal), QUAT_STEP, LOG_SCALE_STEP, OPACITY_STEP, COLOR_STEP, SLOPE_STEP
     step = np.repeat(steps, (3, 4, 3, 1, 3, 6))
     raw[:, ~finite] = 0
-    centers = raw[:3].reshape(3, -1)
-    middle = np.median(centers[:, finite.ravel()], axis=1)
-    within = (np.abs(centers - middle[:, None]) < step[:3, None] * (LARGEST // 2)).all(0).reshape(finite.shape)
-    visible = finite & within & (opacity >= ALPHA_MIN)
+    middle = np.median(raw[:3, finite], axis=1)
+    within = (np.abs(raw[:3] - middle[:, None, None]) < step[:3, None, None] * (LARGEST // 2)).all(0)
+    visible = finite & within & opaque
     kept = visible.any(0)
     if not kept.any():
         return None
@@ -274,8 +258,11 @@ def _quantize(raw: NDArray[np.float32], depths: NDArray[np.float32], first: int,
     values = np.empty(raw.shape, np.uint16)
     for c in range(len(CHANNELS)):
         values[c] = np.rint((raw[c] - float(low[c])) / float(step[c])).clip(0, LARGEST)
-    _repeat_hidden(values, visible)
-    return Block(first, values, low, step, (near, max(far, near * 1.01)), focus)
+    # Where a Gaussian is invisible, its other numbers repeat those of the time step before: they compress to nothing.
+    for channels in (values[:OPACITY], values[OPACITY + 1 :]):
+        for t in range(1, len(visible)):
+            channels[:, t, ~visible[t]] = channels[:, t - 1, ~visible[t]]
+    return Block(first, values, low, step, (near, focus, max(far, near * 1.01)))
 
 
 def pack(values: NDArray[np.uint16]) -> tuple[bytes, list[dict[str, int]]]:
@@ -324,27 +311,15 @@ def _sample(shown: list[Shown], cameras: list[Camera]) -> tuple[NDArray[np.float
 
 
 def _channels(splats: Splats, camera: Camera) -> tuple[NDArray, NDArray]:
+    """(C, N) channels, and (N,) z in the camera, mm."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32)
     towards = splats.means - torch.as_tensor(camera.center, dtype=torch.float32)
     towards = towards / towards.norm(dim=-1, keepdim=True)
     quats = splats.quats / splats.quats.norm(dim=-1, keepdim=True)
     quats = torch.where(quats[:, :1] < 0, -quats, quats)
-    parts = [
-        splats.means,
-        quats,
-        splats.scales.clamp(min=1e-30).log(),
-        splats.opacities[:, None],
-        colors(splats.sh, towards),
-        color_slopes(splats).flatten(1),
-    ]
-    return torch.cat(parts, 1).T.numpy(), (splats.means @ pose[2, :3] + pose[2, 3]).numpy()
-
-
-def _repeat_hidden(values: NDArray[np.uint16], visible: NDArray[np.bool_]) -> None:
-    """Where a Gaussian is invisible, repeat its numbers of the time step before: they compress to nothing."""
-    for channels in (values[:OPACITY], values[OPACITY + 1 :]):
-        for t in range(1, values.shape[1]):
-            channels[:, t, ~visible[t]] = channels[:, t - 1, ~visible[t]]
+    form = [splats.means, quats, splats.scales.clamp(min=1e-30).log(), splats.opacities[:, None]]
+    channels = torch.cat([*form, colors(splats.sh, towards), color_slopes(splats).flatten(1)], 1)
+    return channels.T.numpy(), (splats.means @ pose[2, :3] + pose[2, 3]).numpy()
 
 
 def _zigzag(residual: NDArray[np.uint16]) -> NDArray[np.uint16]:
@@ -353,4 +328,4 @@ def _zigzag(residual: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return ((signed << 1) ^ (signed >> 15)).view(np.uint16)
 
 
-FORMAT = Format(suffixes=(".html",), options=("times", "title", "max_mb"), write=write, holds="a player")
+FORMAT = Format((".html",), ("times", "title", "max_mb"), write=write, holds="a player")

@@ -7,7 +7,7 @@ its XML file formats. An array is the Base64 of its length in bytes, 64 bits, an
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..model.measures import SurfaceMotion, distance, measures_of
 from ..model.scene import Scene
 from ..model.surface import render_surface
 from ..system.atomic import whole_folder
-from ..visualization.measures import MeasuresFigure, displacement_span, measures_csv, stretch_span, value_colors
+from ..visualization.measures import displacement_span, measures_csv, stretch_span, value_colors, write_figure
 from .axes import points_in_axes
 from .formats import ExportOptions, Format, Progress
 from .mesh import depth_grid
@@ -41,12 +41,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             shows no surface.
     """
     num_frames, rate, unit = len(scene.cameras), scene.frames_per_second, length_unit(scene.lengths_are_relative)
-    since, until = options.from_frame, num_frames - 1 if options.to_frame is None else options.to_frame
-    for name, frame in (("--from-frame", since), ("--to-frame", until)):
-        if not 0 <= frame < num_frames:
-            raise input_error(name, f"a frame in 0..{num_frames - 1}", f"{frame}", "choose another.")
-    if since == until:
-        raise input_error("--to-frame", f"another frame than --from-frame {since}", f"{until}", "choose another.")
+    since, until = _frames(options, num_frames)
     times, camera = [i / num_frames for i in range(num_frames)], scene.cameras[since]
     surface = render_surface(scene, times[since], camera, options.min_alpha)
     mesh = depth_grid(surface, options.mesh_step, options.max_slope)
@@ -65,38 +60,45 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     spans = displacement_span(maps["displacement"]), stretch_span(maps["stretch"])
     with whole_folder(out) as folder:
         (folder / SURFACES).mkdir()
-        about = f"axes {options.frame}, unit {unit}"
+        about, files = f"axes {options.axes}, unit {unit}", []
         for k, frame in enumerate(frames):
-            place, now = points_in_axes(moved[k], options.frame), {name: each[k] for name, each in values.items()}
-            (folder / SURFACES / f"{frame:06d}.vtp").write_bytes(vtp_bytes(place, mesh.triangles, now, about))
+            place, now = points_in_axes(moved[k], options.axes), {name: each[k] for name, each in values.items()}
+            files.append(f"{SURFACES}/{frame:06d}.vtp")
+            (folder / files[-1]).write_bytes(vtp_bytes(place, mesh.triangles, now, about))
             progress(k, len(frames))
-        files = [f"{SURFACES}/{frame:06d}.vtp" for frame in frames]
-        (folder / f"{SURFACES}.pvd").write_bytes(pvd_bytes(files, [frame / rate for frame in frames]))
-        positions = points_in_axes(mesh.vertices, options.frame)
+        (folder / f"{SURFACES}.pvd").write_bytes(pvd_bytes({f: i / rate for f, i in zip(files, frames, strict=True)}))
+        positions = points_in_axes(mesh.vertices, options.axes)
         # In the colors of one map, with the values of both.
         for (name, shown), span in zip(maps.items(), spans, strict=True):
             columns = colored(positions, value_colors(shown, span)) | maps
-            (folder / f"{name}.ply").write_bytes(ply_bytes(columns, options.frame, unit, mesh.triangles))
-        figure = MeasuresFigure(f"frame {since} to frame {until}", with_curves=options.points is not None)
-        pixels = np.zeros((0, 2))
+            (folder / f"{name}.ply").write_bytes(ply_bytes(columns, options.axes, unit, mesh.triangles))
+        points, curves = np.zeros((0, 2)), None
         if options.points:
             queries = read_query_points(options.points, scene)
-            starts = back_projected(scene, queries, options.min_alpha)
-            carried = carry(scene, starts, queries.frames, times)
+            carried = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
             paths = carried.positions
             around = motion.stretch(paths[since].astype(np.float64), list(range(num_frames)))
             found = measures_of(paths, around, since, drawn=int(queries.frames[-1]))
             table = measures_csv(found, rate, unit, carried.confidence)
             (folder / "measures.csv").write_text(table, encoding="utf-8", newline="\n")
-            figure.show_curves(found, rate, unit)
-            pixels = project(paths[since].astype(np.float64), camera)[0]
-        figure.show_points(surface.color, pixels)
-        on_image = project(mesh.vertices.astype(np.float64), camera)[0]
+            points, curves = project(paths[since].astype(np.float64), camera)[0], (found, rate, unit)
+        on_image = project(mesh.vertices.astype(np.float64), camera)[0], mesh.triangles
         titles = f"displacement, {unit}", "largest principal stretch; 1: unchanged"
-        for place, (title, shown, span) in enumerate(zip(titles, maps.values(), spans, strict=True), 1):
-            figure.show_map(place, title, on_image, mesh.triangles, shown, span)
-        figure.save(folder / "measures.png")
+        shown = dict(zip(titles, zip(maps.values(), spans, strict=True), strict=True))
+        title = f"frame {since} to frame {until}"
+        write_figure(folder / "measures.png", title, surface.color, points, on_image, shown, curves)
     progress(len(frames), len(frames))
+
+
+def _frames(options: ExportOptions, num_frames: int) -> tuple[int, int]:
+    """The two frames of the options; InputError unless they are two frames of the sequence."""
+    since, until = options.from_frame, num_frames - 1 if options.to_frame is None else options.to_frame
+    for name, frame in (("--from-frame", since), ("--to-frame", until)):
+        if not 0 <= frame < num_frames:
+            raise input_error(name, f"a frame in 0..{num_frames - 1}", f"{frame}", "choose another.")
+    if since == until:
+        raise input_error("--to-frame", f"another frame than --from-frame {since}", f"{until}", "choose another.")
+    return since, until
 
 
 def vtp_bytes(
@@ -125,11 +127,9 @@ def vtp_bytes(
     return "\n".join(lines).encode()
 
 
-def pvd_bytes(files: Sequence[str], seconds: Sequence[float]) -> bytes:
-    """The list of the files of a series, relative to it, and the time of each, s."""
-    sets = [
-        f'<DataSet timestep="{time:.9g}" part="0" file="{file}"/>' for file, time in zip(files, seconds, strict=True)
-    ]
+def pvd_bytes(files: Mapping[str, float]) -> bytes:
+    """The list of the files of a series, relative to it, with the time of each, s."""
+    sets = [f'<DataSet timestep="{time:.9g}" part="0" file="{file}"/>' for file, time in files.items()]
     return "\n".join([VTK_HEAD.format("Collection"), "<Collection>", *sets, "</Collection>\n</VTKFile>\n"]).encode()
 
 
@@ -141,8 +141,8 @@ def _array(name: str, array: NDArray) -> str:
 
 
 FORMAT = Format(
-    suffixes=(),
-    options=("frame", "points", "from_frame", "to_frame", "mesh_step", "max_slope", "min_alpha"),
+    (),
+    ("frame", "points", "from_frame", "to_frame", "mesh_step", "max_slope", "min_alpha"),
     write=write,
     holds="measures over time",
 )

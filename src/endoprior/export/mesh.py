@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -47,8 +48,8 @@ class Mesh:
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The mesh of one time step in the file format of the options; errors as in `surface_mesh`."""
-    mesh, unit = surface_mesh(scene, step, options), length_unit(scene.lengths_are_relative)
-    return {f".{options.mesh_format}": encode_mesh(mesh, options.mesh_format, options.frame, unit)}
+    kind, unit = options.mesh_format or "ply", length_unit(scene.lengths_are_relative)
+    return {f".{kind}": encode_mesh(surface_mesh(scene, step, options), kind, options.axes, unit)}
 
 
 def surface_mesh(scene: Scene, step: TimeStep, options: ExportOptions) -> Mesh:
@@ -71,35 +72,31 @@ def surface_mesh(scene: Scene, step: TimeStep, options: ExportOptions) -> Mesh:
     return mesh
 
 
-# Files.
-
-
-def encode_mesh(mesh: Mesh, suffix: str, axes: Axes, unit: str = "mm") -> bytes:
-    """A mesh in OpenCV axes as the bytes of a file in `axes`, a `suffix` ply, obj or stl; the file names the unit."""
+def encode_mesh(mesh: Mesh, kind: str, axes: Axes, unit: str = "mm") -> bytes:
+    """A mesh in OpenCV axes as the bytes of a file in `axes`, a `kind` ply, obj or stl; the file names the unit."""
     vertices = points_in_axes(mesh.vertices, axes)
-    if suffix == "ply":
+    if kind == "ply":
         return ply_bytes(colored(vertices, mesh.colors), axes, unit, mesh.triangles)
     # `SPACE=LPS` or `SPACE=RAS` is what 3D Slicer looks for.
     about = f"endoprior, axes {axes}, unit {unit}" + (f", SPACE={axes.upper()}" if axes in ("lps", "ras") else "")
-    return _obj(vertices, mesh, about) if suffix == "obj" else _stl(vertices[mesh.triangles], about)
-
-
-def _obj(vertices: NDArray, mesh: Mesh, about: str) -> bytes:
-    text = io.StringIO()
-    text.write(f"# {about}\n")
-    np.savetxt(text, np.column_stack([vertices, mesh.colors / 255]), "v %.6g %.6g %.6g %.4f %.4f %.4f")
-    np.savetxt(text, mesh.triangles + 1, "f %d %d %d")
-    return text.getvalue().encode()
-
-
-def _stl(corners: NDArray, about: str) -> bytes:
-    """Args: corners: (F, 3, 3)."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if kind == "obj":
+        text = io.StringIO(f"# {about}\n")
+        text.seek(0, io.SEEK_END)
+        np.savetxt(text, np.column_stack([vertices, mesh.colors / 255]), "v %.6g %.6g %.6g %.4f %.4f %.4f")
+        np.savetxt(text, mesh.triangles + 1, "f %d %d %d")
+        return text.getvalue().encode()
+    corners = vertices[mesh.triangles]
+    normals = _normals(corners)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     facets["normal"], facets["corners"] = normals / np.where(length > 0, length, 1), corners
     # The header must not begin with "solid": readers would take the file for STL in text form.
     return about.encode().ljust(80) + struct.pack("<I", len(corners)) + facets.tobytes()
+
+
+def _normals(corners: NDArray) -> NDArray:
+    """(F, 3) normals of triangles (F, 3, 3), twice as long as their area."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 # A grid mesh of one depth.
@@ -131,21 +128,17 @@ def split_at_touching_corners(triangles: NDArray[np.int32]) -> tuple[NDArray[np.
     Returns:
         (V,) old number of each new vertex, ascending, and (F, 3) the triangles in new numbers.
     """
-    if not len(triangles):
-        return np.zeros(0, np.intp), triangles.astype(np.int32)
     corners = np.arange(triangles.size).reshape(-1, 3)
-    starts, ends = triangles.ravel(), np.roll(triangles, -1, 1).ravel()
-    # Of each edge, the corners at its smaller and its larger vertex number.
-    here, there = corners.ravel(), np.roll(corners, -1, 1).ravel()
-    smaller, larger = np.where(starts < ends, (here, there), (there, here))
-    order = np.lexsort((np.maximum(starts, ends), np.minimum(starts, ends)))
-    low, high = np.minimum(starts, ends)[order], np.maximum(starts, ends)[order]
-    shared = np.flatnonzero((low[1:] == low[:-1]) & (high[1:] == high[:-1]))
-    one = np.concatenate([smaller[order][shared], larger[order][shared]])
-    other = np.concatenate([smaller[order][shared + 1], larger[order][shared + 1]])
+    # Both ends of each edge: their vertex numbers, the smaller one first, and their corners in the same order.
+    vertices, ends = (np.stack([each, np.roll(each, -1, 1)], -1).reshape(-1, 2) for each in (triangles, corners))
+    flip = np.argsort(vertices, 1, kind="stable")
+    vertices, ends = np.take_along_axis(vertices, flip, 1), np.take_along_axis(ends, flip, 1)
+    order = np.lexsort(vertices.T[::-1])
+    shared = (vertices[order[1:]] == vertices[order[:-1]]).all(1)
+    one, other = ends[order[:-1]][shared].ravel(), ends[order[1:]][shared].ravel()
     links = coo_array((np.ones(len(one), bool), (one, other)), shape=(triangles.size, triangles.size))
     _, fan = connected_components(links, directed=False)
-    pairs, renumbered = np.unique(np.stack([starts, fan], 1), axis=0, return_inverse=True)
+    pairs, renumbered = np.unique(np.stack([triangles.ravel(), fan], 1), axis=0, return_inverse=True)
     return pairs[:, 0].astype(np.intp), renumbered.reshape(-1, 3).astype(np.int32)
 
 
@@ -153,13 +146,11 @@ def _is_continuous(
     depth: NDArray, pixels: NDArray, triangles: NDArray, focal: float, max_slope: float
 ) -> NDArray[np.bool_]:
     """(F,) whether all corners show a surface and no edge is a jump."""
-    continuous = np.ones(len(triangles), bool)
-    for k in range(3):
-        one, other = triangles[:, k], triangles[:, k - 1]
-        near = np.minimum(depth[one], depth[other])
-        sideways = near / focal * np.linalg.norm(pixels[one] - pixels[other], axis=1)
-        continuous &= (near > 0) & (np.abs(depth[one] - depth[other]) <= max_slope * sideways)
-    return continuous
+    z, at = depth[triangles], pixels[triangles]
+    before_z, before_at = np.roll(z, 1, 1), np.roll(at, 1, 1)
+    near = np.minimum(z, before_z)
+    sideways = near / focal * np.linalg.norm(at - before_at, axis=2)
+    return ((near > 0) & (np.abs(z - before_z) <= max_slope * sideways)).all(1)
 
 
 # The depths of several cameras fused.
@@ -171,6 +162,13 @@ MAX_VOXELS = 20_000_000
 # Six tetrahedra around the diagonal from corner 0 to corner 7; bits of a corner's number are its steps along x, y, z.
 _TETRAHEDRA = ((0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7))
 _CORNERS = np.array([[n & 1, n >> 1 & 1, n >> 2 & 1] for n in range(8)])
+# For so many corners inside, which come first, the edges that are cut: three for each triangle.
+_CUTS = (
+    (1, ((0, 1), (0, 2), (0, 3))),
+    (2, ((0, 2), (0, 3), (1, 3))),
+    (2, ((0, 2), (1, 3), (1, 2))),
+    (3, ((3, 0), (3, 1), (3, 2))),
+)
 
 
 def viewpoints(cameras: tuple[Camera, ...]) -> list[Camera]:
@@ -199,9 +197,8 @@ def fused_mesh(views: list[Surface], voxel_mm: float) -> Mesh:
     low, shape = _grid(views, voxel_mm)
     distance, weight = np.zeros((2, *shape), np.float32)
     color = np.zeros((*shape, 3), np.float32)
-    plane = np.stack(np.meshgrid(*(np.arange(n) for n in shape[1:]), indexing="ij"), -1)
     for x in range(shape[0]):  # a slice at a time, so that memory stays small
-        points = low + voxel_mm * np.concatenate([np.full((*shape[1:], 1), x), plane], -1)
+        points = low + voxel_mm * np.stack(np.broadcast_arrays(x, *np.ogrid[: shape[1], : shape[2]]), -1)
         for surface in views:
             _add(surface, points, TRUNCATION_VOXELS * voxel_mm, distance[x], weight[x], color[x])
     share = np.maximum(weight, 1)
@@ -212,21 +209,20 @@ def fused_mesh(views: list[Surface], voxel_mm: float) -> Mesh:
 
 def _grid(views: list[Surface], voxel_mm: float) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
     """First corner (3,), mm, and number of voxels of a grid with a margin around every visible point."""
-    points = [
-        back_project(pixel_centers(surface.camera.width, surface.camera.height)[surface.depth > 0], z, surface.camera)
-        for surface in views
-        if len(z := surface.depth[surface.depth > 0])
-    ]
-    if not points:
-        raise input_error("--min-alpha", "a value that leaves a surface", "one too high", "lower it.")
+    points = []
+    for surface in views:
+        pixels, seen = pixel_centers(surface.camera.width, surface.camera.height), surface.depth > 0
+        points.append(back_project(pixels[seen], surface.depth[seen], surface.camera))
     visible = np.concatenate(points)
+    if not len(visible):
+        raise input_error("--min-alpha", "a value that leaves a surface", "one too high", "lower it.")
     margin = (TRUNCATION_VOXELS + 1) * voxel_mm
     low = visible.min(0) - margin
-    shape = tuple(int(n) for n in np.ceil((visible.max(0) + margin - low) / voxel_mm) + 1)
-    if np.prod(shape, dtype=np.float64) > MAX_VOXELS:
-        least = voxel_mm * (np.prod(shape, dtype=np.float64) / MAX_VOXELS) ** (1 / 3)
+    nx, ny, nz = (int(n) for n in np.ceil((visible.max(0) + margin - low) / voxel_mm) + 1)
+    if nx * ny * nz > MAX_VOXELS:
+        least = voxel_mm * (nx * ny * nz / MAX_VOXELS) ** (1 / 3)
         raise input_error("--voxel-mm", f"at least {least:.2f} for a scene of this size", f"{voxel_mm}", "raise it.")
-    return low, shape
+    return low, (nx, ny, nz)
 
 
 def _add(
@@ -234,7 +230,7 @@ def _add(
 ) -> None:
     """Add the distance, weight and color of points (..., 3) in one view to their sums."""
     pixels, z = project(points, surface.camera)
-    column, row = np.floor(pixels[..., 0]), np.floor(pixels[..., 1])
+    column, row = np.moveaxis(np.floor(pixels), -1, 0)
     inside = (z > 0) & (column >= 0) & (row >= 0) & (column < surface.camera.width) & (row < surface.camera.height)
     row, column = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
     depth = surface.depth[row, column]
@@ -245,31 +241,28 @@ def _add(
     color += np.where(known[..., None], surface.color[row, column], 0)
 
 
-def _zero_surface(
-    field: NDArray[np.float32], known: NDArray[np.bool_], color: NDArray[np.float32]
-) -> tuple[NDArray, NDArray, NDArray]:
+def _zero_surface(field: NDArray, known: NDArray[np.bool_], color: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Vertices (V, 3) in voxels, triangles (F, 3) and colors of the zero level within cubes known at every corner."""
-    offsets = _CORNERS @ np.array([field.shape[1] * field.shape[2], field.shape[2], 1])
-    inside = np.stack([field[_shifted(field.shape, c)] < 0 for c in _CORNERS])
-    whole = np.logical_and.reduce([known[_shifted(known.shape, c)] for c in _CORNERS])
-    crossed = whole & inside.any(0) & ~inside.all(0)
-    numbers = np.arange(field.size).reshape(field.shape)[:-1, :-1, :-1][crossed]
-    values = field.ravel()
-    cut = [_triangles_of(numbers[:, None] + offsets[list(corners)], values) for corners in _TETRAHEDRA]
-    edges = np.concatenate(cut)  # (F, 3, 2): each vertex lies between two grid points
+    to_corners, values = _CORNERS @ [field.shape[1] * field.shape[2], field.shape[2], 1], field.ravel()
+    # Of each grid point, the cube of which it is the first corner.
+    crossed = minimum_filter(known.astype(np.uint8), 2, origin=-1) > 0
+    crossed &= (minimum_filter(field, 2, origin=-1) < 0) & (maximum_filter(field, 2, origin=-1) >= 0)
+    crossed[-1], crossed[:, -1], crossed[:, :, -1] = False, False, False
+    cubes = np.flatnonzero(crossed)[:, None] + to_corners
+    edges = np.concatenate([_triangles_of(cubes[:, corners], values) for corners in _TETRAHEDRA])
     keys, renumbered = np.unique(np.sort(edges, -1).reshape(-1, 2) @ [field.size, 1], return_inverse=True)
-    lower, upper = keys // field.size, keys % field.size
-    share = (values[lower] / (values[lower] - values[upper])).astype(np.float64)[:, None]
-    vertices = _places(lower, field.shape) * (1 - share) + _places(upper, field.shape) * share
+    ends = np.stack(np.divmod(keys, field.size))  # of each vertex: the two grid points between which it lies
+    low, high = values[ends]
+    share = (low / (low - high)).astype(np.float64)[:, None]
+    lower, upper = _places(ends, field.shape)
+    vertices = lower * (1 - share) + upper * share
     triangles = renumbered.reshape(-1, 3)
     # Normals must point to where the field is positive, outside: from the inner to the outer ends of the edges.
     outwards = (_places(edges, field.shape) * np.where(values[edges] < 0, -1, 1)[..., None]).sum((1, 2))
-    corners = vertices[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    wrong = (normal * outwards).sum(1) < 0
+    wrong = (_normals(vertices[triangles]) * outwards).sum(1) < 0
     triangles[wrong] = triangles[wrong][:, ::-1]
-    flat = color.reshape(-1, 3)
-    return vertices, triangles, flat[lower] * (1 - share) + flat[upper] * share
+    first_color, second_color = color.reshape(-1, 3)[ends]
+    return vertices, triangles, first_color * (1 - share) + second_color * share
 
 
 def _places(numbers: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.intp]:
@@ -277,26 +270,12 @@ def _places(numbers: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.int
     return np.stack(np.unravel_index(numbers, shape), -1)
 
 
-def _shifted(shape: tuple[int, ...], corner: NDArray) -> tuple[slice, ...]:
-    """Of all cubes of a grid, the grid points at one corner."""
-    return tuple(slice(int(step), size - 1 + int(step)) for step, size in zip(corner, shape, strict=True))
-
-
-def _triangles_of(corners: NDArray[np.intp], values: NDArray[np.float32]) -> NDArray[np.intp]:
+def _triangles_of(corners: NDArray[np.intp], values: NDArray) -> NDArray[np.intp]:
     """(F, 3, 2) edges, as pairs of grid points, that the surface's triangles cut in tetrahedra with corners (M, 4)."""
     order = np.argsort(values[corners] >= 0, axis=1, kind="stable")  # those inside come first
     corners = np.take_along_axis(corners, order, 1)
     num_inside = (values[corners] < 0).sum(1)
-    a, b, c, d = corners.T
-    cut = []
-    for count, triangles in {
-        1: [((a, b), (a, c), (a, d))],
-        2: [((a, c), (a, d), (b, d)), ((a, c), (b, d), (b, c))],
-        3: [((d, a), (d, b), (d, c))],
-    }.items():
-        rows = num_inside == count
-        cut += [np.stack([np.stack([p[rows], q[rows]], -1) for p, q in edges], 1) for edges in triangles]
-    return np.concatenate(cut)
+    return np.concatenate([corners[num_inside == count][:, cut] for count, cut in _CUTS])
 
 
 FORMAT = Format(

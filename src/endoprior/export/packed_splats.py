@@ -2,7 +2,7 @@
 
 Sources: https://developer.playcanvas.com (compressed PLY; The SOG Format), https://github.com/nianticlabs/spz,
 https://github.com/antimatter15/splat. SuperSplat and splat-transform read all. Equal Gaussians give equal bytes. `N`
-Gaussians, `C` chunks.
+Gaussians, `C` chunks. Encoders raise InputError for a position that is not finite.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from ..core.types import Splats
 from ..model.gaussians import SH_C0
 from ..model.scene import Scene
 from ..render.sh import degree_of
-from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format
-from .ply import unit_quaternions, when
+from .formats import Axes, ExportOptions, Format
+from .ply import GAUSSIAN_OPTIONS, unit_quaternions, when
 from .time_steps import TimeStep
 
 # Compressed PLY: 16 bytes a Gaussian, and 18 floats for each chunk of 256 of them.
@@ -35,16 +35,19 @@ from .time_steps import TimeStep
 CHUNK = 256
 LOG_SCALES = (-20.0, 20.0)
 """Readers take no log scale beyond."""
-RANGES = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
-RANGES += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
-RANGES += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+RANGES = [
+    f"{end}_{name}"
+    for names in ("x y z", "scale_x scale_y scale_z", "r g b")
+    for end in ("min", "max")
+    for name in names.split()
+]
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def compressed_ply(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The compressed PLY file of one time step."""
-    unit, splats = length_unit(scene.lengths_are_relative), step.plain_splats(scene, options.frame)
-    return {".ply": encode_compressed_ply(splats, options.frame, unit, when(scene, step))}
+    unit, splats = length_unit(scene.lengths_are_relative), step.plain_splats(scene, options.axes)
+    return {".ply": encode_compressed_ply(splats, options.axes, unit, when(scene, step))}
 
 
 def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment: str = "") -> bytes:
@@ -53,20 +56,17 @@ def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm
     Position and log scale: 11, 10 and 11 bits within the range of their chunk. Color 0.5 + C0 dc: 8 bits a channel
     within that of the chunk; opacity 8 bits. Rotation: the place of the largest of w, x, y, z in 2 bits, the three
     others in 10 bits each, times 1 / sqrt(2). Higher harmonics: 8 bits, steps of 8 / 255 from -4.
-
-    Raises:
-        InputError: a position is not finite.
     """
     means, log_scales, quats, opacities, sh = _ordered(splats, "compressed_ply")
-    colors = 0.5 + SH_C0 * sh[:, 0]
-    of_mean, of_scale, of_color = (_ranges(values) for values in (means, log_scales, colors))
-    red, green, blue = _in_bits(_within(colors, of_color), 8).T
-    largest, (a, b, c) = (part.T for part in _smallest_three(quats, 10))
+    (means, of_mean), (scales, of_scale), (colors, of_color) = map(
+        _within_chunks, (means, log_scales, 0.5 + SH_C0 * sh[:, 0])
+    )
+    largest, others = _smallest_three(quats, 10)
     vertices = [
-        _packed(_within(means, of_mean)),
-        largest << 30 | a << 20 | b << 10 | c,
-        _packed(_within(log_scales, of_scale)),
-        red << 24 | green << 16 | blue << 8 | _in_bits(opacities, 8),
+        _packed(_in_bits(means, (11, 10, 11)), (21, 11, 0)),
+        largest << 30 | _packed(others, (20, 10, 0)),
+        _packed(_in_bits(scales, (11, 10, 11)), (21, 11, 0)),
+        _packed(np.column_stack([_in_bits(colors, 8), _in_bits(opacities, 8)]), (24, 16, 8, 0)),
     ]
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * sh.shape[1] - 3)
     ranges = np.concatenate([of_mean, of_scale, of_color], 1).astype("<f4")
@@ -81,26 +81,21 @@ def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm
     return header.encode() + ranges.tobytes() + body
 
 
-def _ranges(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(C, 6) the least and the largest of (N, 3) values in each chunk, rounded outward to float32."""
+def _within_chunks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Where (N, 3) values lie between the ends of their chunk, 0..1, and (C, 6) these, rounded outward to float32."""
     starts = np.arange(0, len(values), CHUNK)
     if not len(starts):
-        return np.zeros((0, 6), np.float32)
-    low = np.minimum.reduceat(values, starts).astype(np.float32)
-    high = np.maximum.reduceat(values, starts).astype(np.float32)
-    return np.concatenate([np.nextafter(low, -np.inf), np.nextafter(high, np.inf)], 1, dtype=np.float32)
+        return values, np.zeros((0, 6), np.float32)
+    low = np.nextafter(np.minimum.reduceat(values, starts).astype(np.float32), np.float32(-np.inf))
+    high = np.nextafter(np.maximum.reduceat(values, starts).astype(np.float32), np.float32(np.inf))
+    ends = np.concatenate([low, high], 1)
+    own = np.repeat(ends.astype(np.float64), CHUNK, axis=0)[: len(values)]
+    return (values - own[:, :3]) / (own[:, 3:] - own[:, :3]), ends
 
 
-def _within(values: NDArray[np.float64], ranges: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N, 3) where each value lies between the ends of its chunk, 0..1."""
-    own = np.repeat(ranges.astype(np.float64), CHUNK, axis=0)[: len(values)]
-    return (values - own[:, :3]) / (own[:, 3:] - own[:, :3])
-
-
-def _packed(shares: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(N,) three shares in 11, 10 and 11 bits."""
-    x, y, z = (_in_bits(shares[:, i], bits) for i, bits in enumerate((11, 10, 11)))
-    return x << 21 | y << 11 | z
+def _packed(columns: NDArray[np.int64], shifts: tuple[int, ...]) -> NDArray[np.int64]:
+    """(N,) columns of integers side by side in one, each shifted by so many bits."""
+    return np.bitwise_or.reduce(columns << shifts, axis=1)
 
 
 # SOG version 2: a zip archive of images with one pixel per Gaussian, in the axes of a PLY file.
@@ -114,9 +109,6 @@ def encode_sog(splats: Splats) -> bytes:
 
     Position: 16 bits for sign(x) ln(|x| + 1) between the ends of each axis. Log scale and mean color: one of 256 equal
     steps. Opacity: 8 bits. Rotation: as in `_smallest_three`, 8 bits.
-
-    Raises:
-        InputError: a position is not finite.
     """
     means, log_scales, quats, opacities, sh = _ordered(splats, "sog")
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -133,9 +125,9 @@ def encode_sog(splats: Splats) -> bytes:
     }
     about: dict[str, Any] = {"version": 2, "asset": {"generator": "endoprior"}, "count": len(means), "antialias": False}
     about["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]}
-    about["scales"] = {"codebook": of_scale.tolist(), "files": ["scales.webp"]}
+    about["scales"] = {"codebook": of_scale, "files": ["scales.webp"]}
     about["quats"] = {"files": ["quats.webp"]}
-    about["sh0"] = {"codebook": of_color.tolist(), "files": ["sh0.webp"]}
+    about["sh0"] = {"codebook": of_color, "files": ["sh0.webp"]}
     file = io.BytesIO()
     with ZipFile(file, "w") as archive:  # `ZipInfo` dates all files 1980; images are compressed as they are
         archive.writestr(ZipInfo("meta.json"), json.dumps(about, allow_nan=False))
@@ -144,10 +136,10 @@ def encode_sog(splats: Splats) -> bytes:
     return file.getvalue()
 
 
-def _by_codebook(values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _by_codebook(values: NDArray[np.float64]) -> tuple[NDArray[np.int64], list[float]]:
     """The 8-bit place of each value in 256 equal steps, and these."""
     low, high = values.min(), values.max()
-    return _in_bits((values - low) / max(high - low, 1e-9), 8), np.linspace(low, high, 256).round(6)
+    return _in_bits((values - low) / max(high - low, 1e-9), 8), np.linspace(low, high, 256).round(6).tolist()
 
 
 def _webp(values: NDArray[np.int64]) -> bytes:
@@ -174,9 +166,6 @@ def encode_spz(splats: Splats) -> bytes:
 
     Positions: 24-bit fixed point. Opacity, color, log scale (16 steps per unit from -10): 8 bits. Rotation: x, y, z of
     a unit quaternion with w >= 0, 8 bits each. Higher harmonics: 8 bits, 128 steps per unit, -1 to 1.
-
-    Raises:
-        InputError: a position is not finite.
     """
     means, sh = _finite_means(splats, "spz"), splats.sh.numpy()
     largest = np.abs(means).max(initial=0.0)
@@ -236,25 +225,22 @@ def _finite_means(splats: Splats, name: str) -> NDArray[np.float64]:
     return means
 
 
-def _ordered(splats: Splats, name: str) -> tuple[NDArray[np.float64], ...]:
-    """Positions, log scales, quaternions, opacities and coefficients along a curve that keeps neighbors together.
+def _ordered(splats: Splats, name: str) -> list[NDArray[np.float64]]:
+    """Positions, log scales, quaternions, opacities and coefficients along a Z-order curve of 2^10 cells an axis.
 
-    The curve is a Z-order curve of 2^10 cells along each axis. `name` is the format's, for the error.
+    `name` is the format's, for the error.
     """
     means = _finite_means(splats, name)
     low = means.min(0, initial=np.inf)
     size = max(float((means.max(0, initial=-np.inf) - low).max()), 1e-9)
     cells = np.floor((means - low) / size * 1023).astype(np.int64)
-    places = np.zeros(len(means), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            places |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    bits = cells[:, None] >> np.arange(10)[:, None] & 1  # (N, 10, 3)
+    places = (bits.reshape(len(means), 30) << np.arange(30)).sum(1)
+    others = (splats.scales, splats.quats, splats.opacities, splats.sh)
+    values = [means, *(tensor.numpy().astype(np.float64) for tensor in others)]
+    values[1] = np.log(values[1].clip(1e-30)).clip(*LOG_SCALES)
     order = np.argsort(places, kind="stable")
-    scales, *others = (
-        tensor.numpy().astype(np.float64)[order]
-        for tensor in (splats.scales, splats.quats, splats.opacities, splats.sh)
-    )
-    return means[order], np.log(scales.clip(1e-30)).clip(*LOG_SCALES), *others
+    return [each[order] for each in values]
 
 
 def _smallest_three(quats: NDArray[np.float64], bits: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -266,9 +252,10 @@ def _smallest_three(quats: NDArray[np.float64], bits: int) -> tuple[NDArray[np.i
     return largest, _in_bits(others / np.sqrt(2) + 0.5, bits)
 
 
-def _in_bits(shares: NDArray[np.float64], bits: int) -> NDArray[np.int64]:
+def _in_bits(shares: NDArray[np.float64], bits: int | tuple[int, ...]) -> NDArray[np.int64]:
     """The integers of so many bits for values in 0..1."""
-    return np.rint(shares * (2**bits - 1)).clip(0, 2**bits - 1).astype(np.int64)
+    most = 2 ** np.array(bits) - 1
+    return np.rint(shares * most).clip(0, most).astype(np.int64)
 
 
 def _bytes(values: NDArray) -> NDArray[np.uint8]:
@@ -277,20 +264,12 @@ def _bytes(values: NDArray) -> NDArray[np.uint8]:
 
 def _format(suffix: str, encode: Callable[[Splats], bytes], axes: Axes = "opencv") -> Format:
     """A format of one file for each time step that says nothing of axes and time."""
-    return Format(
-        suffixes=(suffix,),
-        options=(*TIME_STEP_OPTIONS, "canonical"),
-        files=lambda scene, step, options: {suffix: encode(step.plain_splats(scene, options.frame))},
-        default_axes=axes,
-        holds="Gaussians",
-    )
+
+    def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+        return {suffix: encode(step.plain_splats(scene, options.axes))}
+
+    return Format((suffix,), GAUSSIAN_OPTIONS, files, default_axes=axes, holds="Gaussians")
 
 
 SOG, SPZ, SPLAT = _format(".sog", encode_sog), _format(".spz", encode_spz, "opengl"), _format(".splat", encode_splat)
-COMPRESSED_PLY = Format(
-    suffixes=(".ply",),
-    options=(*TIME_STEP_OPTIONS, "canonical"),
-    files=compressed_ply,
-    holds="compressed Gaussians",
-    has_index=False,  # as in a folder of `ply`
-)
+COMPRESSED_PLY = Format((".ply",), GAUSSIAN_OPTIONS, compressed_ply, holds="compressed Gaussians", has_index=False)

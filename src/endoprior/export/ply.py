@@ -1,10 +1,12 @@
 """PLY files: Gaussians in the layout of 3D Gaussian splatting, colored points, and what every PLY file shares.
 
 Source of the layout: the files that 3DGS writes (Kerbl et al. 2023); of the file format: Turk, "The PLY Polygon File
-Format", 1994. `K` spherical-harmonic coefficients per channel.
+Format", 1994.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -25,31 +27,30 @@ LEAST_OPACITY = 1e-7
 
 def gaussians(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The Gaussians of one time step."""
-    unit = length_unit(scene.lengths_are_relative)
-    return {".ply": encode_ply(step.plain_splats(scene, options.frame), options.frame, unit, when(scene, step))}
+    splats, unit = step.plain_splats(scene, options.axes), length_unit(scene.lengths_are_relative)
+    return {".ply": encode_ply(splats, options.axes, unit, when(scene, step))}
 
 
 def when(scene: Scene, step: TimeStep) -> str:
     """The comment of a PLY file on its time; no other file may lie beside it (`has_index`)."""
-    words = [f"{name} {value}" for name, value in step.facts().items() if value is not None] or ["canonical"]
+    words = ["canonical"] if step.canonical else [f"{name} {value}" for name, value in step.facts().items()]
     words += [f"frames_per_second {scene.frames_per_second:g}"] if scene.frames_per_second else []
     return ", ".join(words)
 
 
 def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment: str = "") -> bytes:
-    """Binary PLY with one vertex per Gaussian, all properties float32. Args: comment: on the time.
+    """Binary PLY with one vertex per Gaussian, all properties float32.
 
     x y z (mm), nx ny nz (0), f_dc_0..2, f_rest_0.. (all of red, then green, then blue, each in the order of
     docs/format.md), opacity (logit), scale_0..2 (log of mm), rot_0..3 (w, x, y, z, of length 1).
     """
     sh = splats.sh.numpy()
     opacities = splats.opacities.numpy().astype(np.float64).clip(LEAST_OPACITY, 1 - LEAST_OPACITY)
-    columns = numbered("xyz", splats.means.numpy())
-    columns |= {name: np.zeros(len(sh)) for name in ("nx", "ny", "nz")}
-    columns |= numbered("f_dc_", sh[:, 0]) | numbered("f_rest_", sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1))
+    columns = _numbered("xyz", splats.means.numpy()) | dict.fromkeys(("nx", "ny", "nz"), np.zeros(len(sh)))
+    columns |= _numbered("f_dc_", sh[:, 0]) | _numbered("f_rest_", sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1))
     columns["opacity"] = np.log(opacities / (1 - opacities))
-    columns |= numbered("scale_", np.log(splats.scales.numpy().clip(1e-30)))
-    columns |= numbered("rot_", unit_quaternions(splats.quats.numpy().astype(np.float64)))
+    columns |= _numbered("scale_", np.log(splats.scales.numpy().clip(1e-30)))
+    columns |= _numbered("rot_", unit_quaternions(splats.quats.numpy().astype(np.float64)))
     return ply_bytes(columns, axes, unit, comment=comment)
 
 
@@ -72,35 +73,29 @@ def points(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, by
     means = splats.means[opaque]
     towards = torch.nn.functional.normalize(means - torch.from_numpy(step.camera(scene).center).to(means.dtype))
     colors = np.rint(harmonics.colors(splats.sh[opaque], towards).numpy().clip(0, 1) * 255).astype(np.uint8)
-    columns = colored(points_in_axes(means.numpy(), options.frame), colors)
-    return {".ply": ply_bytes(columns, options.frame, length_unit(scene.lengths_are_relative))}
+    columns = colored(points_in_axes(means.numpy(), options.axes), colors)
+    return {".ply": ply_bytes(columns, options.axes, length_unit(scene.lengths_are_relative))}
 
 
 def colored(positions: NDArray, colors: NDArray[np.uint8]) -> dict[str, NDArray]:
     """The properties of points (P, 3) with colors (P, 3), 0..255."""
-    return numbered("xyz", positions) | numbered(("red", "green", "blue"), colors)
+    return _numbered("xyz", positions) | dict(zip(("red", "green", "blue"), colors.T, strict=True))
 
 
-def numbered(names: str | tuple[str, ...], values: NDArray) -> dict[str, NDArray]:
-    """The columns of an array by `names`, or by a name that ends in `_` and their number."""
-    if isinstance(names, str) and names.endswith("_"):
-        names = tuple(f"{names}{i}" for i in range(values.shape[1]))
+def _numbered(name: str, values: NDArray) -> dict[str, NDArray]:
+    """The columns of an array by the letters of `name`, or by a name that ends in `_` and their number."""
+    names = [f"{name}{i}" for i in range(values.shape[1])] if name.endswith("_") else name
     return dict(zip(names, values.T, strict=True))
 
 
 def ply_bytes(
-    columns: dict[str, NDArray],
-    axes: Axes,
-    unit: str,
-    triangles: NDArray[np.int32] | None = None,
-    comment: str = "",
+    columns: Mapping[str, NDArray], axes: Axes, unit: str, triangles: NDArray[np.int32] | None = None, comment: str = ""
 ) -> bytes:
     """A little-endian binary PLY file.
 
     Args:
         columns: equally long properties of the vertices; 8-bit stays 8-bit, everything else becomes float32.
         axes: named in a comment; `SPACE=LPS` or `SPACE=RAS` is what 3D Slicer looks for.
-        unit: of lengths, named in the same comment.
         triangles: (F, 3) vertex numbers.
         comment: one more line of text.
     """
@@ -122,13 +117,12 @@ def ply_bytes(
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + body
 
 
+GAUSSIAN_OPTIONS = (*TIME_STEP_OPTIONS, "canonical")
 PLY = Format(
     suffixes=(".ply",),
-    options=(*TIME_STEP_OPTIONS, "canonical"),
+    options=GAUSSIAN_OPTIONS,
     files=gaussians,
     holds="Gaussians",
     has_index=False,  # SuperSplat plays a folder as a sequence only if it holds nothing else
 )
-POINTS = Format(
-    suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical", "min_opacity"), files=points, holds="colored points"
-)
+POINTS = Format((".ply",), (*GAUSSIAN_OPTIONS, "min_opacity"), points, holds="colored points")

@@ -11,11 +11,11 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, indent, tostring
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
@@ -53,9 +53,13 @@ class Played:
     """What one sequence holds."""
 
     name: str
-    tags: tuple[str, str]
-    """Of its nodes, and of their storage nodes."""
     suffix: str
+    tag: str
+    """Of its nodes."""
+    storage: str
+    display: str
+    """Tags of their storage and display nodes, with the attributes of the latter in `look`."""
+    look: Mapping[str, str]
 
     @property
     def first_file(self) -> str:
@@ -68,22 +72,18 @@ class Played:
         return f"Data/{self.name}.seq.mrb"
 
 
-TISSUE = Played("tissue", ("Model", "ModelStorage"), ".ply")
-POINTS = Played("points", ("MarkupsFiducial", "MarkupsJsonStorage"), ".mrk.json")
-DISPLAYS = {
-    TISSUE: {
-        "tag": "ModelDisplay",
-        "scalarVisibility": "true",
-        "activeScalarName": "RGB",  # the name that VTK gives the colors of a PLY file
-        "activeAttributeLocation": "point",
-        "scalarRangeFlag": "UseDirectMapping",
-        "ambient": "1",  # colors are those of the video, the endoscope's light included: do not light them again
-        "diffuse": "0",
-        "backfaceCulling": "false",
-    },
-    POINTS: {"tag": "MarkupsDisplay", "pointLabelsVisibility": "true"},
+COLORED = {
+    "scalarVisibility": "true",
+    "activeScalarName": "RGB",  # the name that VTK gives the colors of a PLY file
+    "activeAttributeLocation": "point",
+    "scalarRangeFlag": "UseDirectMapping",
+    "ambient": "1",  # colors are those of the video, the endoscope's light included: do not light them again
+    "diffuse": "0",
+    "backfaceCulling": "false",
 }
-"""Class and attributes of the display node of each."""
+LABELED = {"pointLabelsVisibility": "true"}
+TISSUE = Played("tissue", ".ply", "Model", "ModelStorage", "ModelDisplay", COLORED)
+POINTS = Played("points", ".mrk.json", "MarkupsFiducial", "MarkupsJsonStorage", "MarkupsDisplay", LABELED)
 
 
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
@@ -98,23 +98,24 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         raise input_error(out, want, "one", fix)
     steps = selected_time_steps(scene, options)
     seconds = seconds_of_motion(scene, steps)
-    played: dict[Played, Iterable[bytes]] = {}
     meshes = (surface_mesh(scene, step, options) for step in steps)
     first, unit = next(meshes), length_unit(scene.lengths_are_relative)
-    played[TISSUE] = (encode_mesh(mesh, "ply", "lps", unit) for mesh in chain([first], meshes))
+    surfaces = (encode_mesh(mesh, "ply", "lps", unit) for mesh in chain([first], meshes))
+    files: list[tuple[Played, Iterable[bytes]]] = [(TISSUE, surfaces)]
     if options.points:
-        found = _carried(scene, options, steps)
-        played[POINTS] = (markups(*there) for there in zip(found.positions, found.confidence, strict=True))
+        found = _carried(scene, options.points, options.min_alpha, steps)
+        files.append((POINTS, (markups(*there) for there in zip(found.positions, found.confidence, strict=True))))
     with whole_file(out) as temporary, ZipFile(temporary, "w") as archive:
-        _put(archive, f"{FOLDER}.mrml", _scene_text(first, steps[0].camera(scene), seconds, list(played)))
-        for each, contents in played.items():
-            _put_sequence(archive, each, _counted(contents, len(steps), progress), seconds)
+        start = _scene_text(first, steps[0].camera(scene), seconds, [played for played, _ in files])
+        _put(archive, f"{FOLDER}.mrml", start)
+        for played, contents in files:
+            _put_sequence(archive, played, contents, seconds, progress)
 
 
-def _carried(scene: Scene, options: ExportOptions, steps: list[TimeStep]) -> CarriedPoints:
-    """The query points of `options` at the time steps."""
-    queries = read_query_points(options.points, scene)
-    starts = back_projected(scene, queries, options.min_alpha)
+def _carried(scene: Scene, file: Path, min_alpha: float, steps: list[TimeStep]) -> CarriedPoints:
+    """The query points of a file at the time steps."""
+    queries = read_query_points(file, scene)
+    starts = back_projected(scene, queries, min_alpha)
     frames, own = np.unique(queries.frames, return_inverse=True)
     times = [*(frames / len(scene.cameras)), *(step.time for step in steps)]
     found = carry(scene, starts, own, times)
@@ -131,25 +132,22 @@ def markups(positions: NDArray[np.float32], confidence: NDArray[np.float32]) -> 
     return json.dumps({"@schema": MARKUPS_SCHEMA, "markups": [fiducials]}, allow_nan=False).encode()
 
 
-def _counted(contents: Iterable[bytes], total: int, progress: Progress) -> Iterator[bytes]:
-    for k, content in enumerate(contents):
-        yield content
-        progress(k + 1, total)
-
-
-def _put_sequence(archive: ZipFile, played: Played, contents: Iterable[bytes], seconds: list[float]) -> None:
+def _put_sequence(
+    archive: ZipFile, played: Played, contents: Iterable[bytes], seconds: list[float], progress: Progress
+) -> None:
     """Add what is shown at the start, and the archive of a sequence: a node for each time step, and an index."""
-    scene = SlicerScene()
+    nodes: list[Element] = []
     with tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as sequence:
         with ZipFile(sequence, "w") as inner:
-            for k, content in enumerate(contents):
-                if not k:
+            for k, content in enumerate(contents, 1):
+                if k == 1:
                     _put(archive, played.first_file, content)
-                name = f"Data/{played.name}_{k}{played.suffix}"
+                name = f"Data/{played.name}_{k - 1}{played.suffix}"
                 _put(inner, name, content)
-                scene.add_stored(played.tags, played.name, name)
-            scene.add("Sequence", played.name, singleton="SequenceIndex", **_index(played, seconds))
-            _put(inner, f"{FOLDER}.mrml", scene.file())
+                nodes += _stored(played, k, name)
+                progress(k, len(seconds))
+            nodes.append(_node("Sequence", "SequenceIndex", played.name, _index(played, seconds)))
+            _put(inner, f"{FOLDER}.mrml", _scene(nodes))
         entry = _entry(played.sequence_file)  # stored as it is: its files are compressed
         entry.file_size = sequence.tell()
         sequence.seek(0)
@@ -159,40 +157,32 @@ def _put_sequence(archive: ZipFile, played: Played, contents: Iterable[bytes], s
 
 def _scene_text(first: Mesh, camera: Camera, seconds: list[float], played: list[Played]) -> bytes:
     """The scene that Slicer opens, with the first time step shown."""
-    scene = SlicerScene()
-    scene.add("Camera", "Camera", singleton="1", **_view(first, camera))
-    roles: dict[str, str] = {}
+    nodes, roles = [_node("Camera", "1", "Camera", _view(first, camera))], {}
     for k, each in enumerate(played):
-        display = scene.add(name="display", **DISPLAYS[each])
-        shown = scene.add_stored(each.tags, each.name, each.first_file, {"display": display})
-        storage = scene.add("SequenceStorage", "storage", fileName=each.sequence_file)
-        attributes = {"attributes": f"DataNodeClassName:vtkMRML{each.tags[0]}Node", **_index(each, seconds)}
-        sequence = scene.add("Sequence", each.name, {"storage": storage}, **attributes)
-        roles |= {f"sequenceNodeRef{k}": sequence, f"dataNodeRef{k}": shown}
+        display = _node(each.display, 1, "display", each.look)
+        stored = _stored(each, 1, each.first_file, display=display)
+        storage = _node("SequenceStorage", k + 1, "storage", {"fileName": each.sequence_file})
+        attributes = {"attributes": f"DataNodeClassName:vtkMRML{each.tag}Node"} | _index(each, seconds)
+        sequence = _node("Sequence", k + 1, each.name, attributes, storage=storage)
+        nodes += [display, *stored, storage, sequence]
+        roles |= {f"sequenceNodeRef{k}": sequence, f"dataNodeRef{k}": stored[-1]}
     synchronization = "playback true recording false overwriteProxyName false saveChanges false"
-    scene.add(
-        "SequenceBrowser",
-        "tissue",
-        roles,
-        virtualNodePostfixes=" ".join(str(k) for k in range(len(played))),
-        playbackRateFps=f"{(len(seconds) - 1) / (seconds[-1] - seconds[0]):.6g}",
-        playbackLooped="true",
-        selectedItemNumber="0",
-        **{f"SynchronizationPropertiesMap{k}": synchronization for k in range(len(played))},
-    )
-    return scene.file()
+    browser = {
+        "virtualNodePostfixes": " ".join(str(k) for k in range(len(played))),
+        "playbackRateFps": f"{(len(seconds) - 1) / (seconds[-1] - seconds[0]):.6g}",
+        "playbackLooped": "true",
+        "selectedItemNumber": "0",
+    }
+    browser |= {f"SynchronizationPropertiesMap{k}": synchronization for k in range(len(played))}
+    return _scene([*nodes, _node("SequenceBrowser", 1, "tissue", browser, **roles)])
 
 
 def _index(played: Played, seconds: list[float]) -> dict[str, str]:
     """What says at which second each node of the sequence is shown."""
-    nodes = (f"vtkMRML{played.tags[0]}Node{k + 1}:{second:.9g}" for k, second in enumerate(seconds))
-    return {
-        "indexName": "time",
-        "indexUnit": "s",
-        "indexType": "numeric",
-        "numericIndexValueTolerance": f"{np.diff(seconds).min() / 10:.3g}",
-        "indexValues": ";".join(nodes),
-    }
+    nodes = (f"vtkMRML{played.tag}Node{k + 1}:{second:.9g}" for k, second in enumerate(seconds))
+    kind = {"indexName": "time", "indexUnit": "s", "indexType": "numeric"}
+    tolerance = f"{np.diff(seconds).min() / 10:.3g}"
+    return kind | {"numericIndexValueTolerance": tolerance, "indexValues": ";".join(nodes)}
 
 
 def _view(mesh: Mesh, camera: Camera) -> dict[str, str]:
@@ -214,52 +204,32 @@ def _entry(name: str) -> ZipInfo:
     return ZipInfo(f"{FOLDER}/{name}")
 
 
-class SlicerScene:
-    """A scene to write: nodes with attributes that refer to one another by id."""
-
-    def __init__(self) -> None:
-        self._root = ElementTree.Element("MRML", version=SCENE_VERSION, userTags="")
-
-    def add(
-        self, tag: str, name: str, references: dict[str, str] | None = None, singleton: str = "", **attributes: str
-    ) -> str:
-        """Append a node and return its id.
-
-        Args:
-            tag: the node's class `vtkMRML...Node` without prefix and suffix.
-            references: ids of other nodes, by role.
-            singleton: tag of a node that replaces the one of the same class and tag in Slicer; its id ends in it.
-        """
-        number = singleton or str(len(self._root.findall(tag)) + 1)
-        identity = f"vtkMRML{tag}Node{number}"
-        if singleton:
-            attributes["singletonTag"] = singleton
-        if references:
-            attributes["references"] = "".join(f"{role}:{other};" for role, other in references.items())
-        ElementTree.SubElement(self._root, tag, {"id": identity, "name": name, **attributes})
-        return identity
-
-    def add_stored(
-        self, kind: tuple[str, str], name: str, file: str, references: dict[str, str] | None = None, **attributes: str
-    ) -> str:
-        """Append a node whose data is in `file`, relative to the scene's own, in LPS axes; return its id.
-
-        Args:
-            kind: tags of the node and of its storage node.
-        """
-        tag, storage_tag = kind
-        storage = self.add(storage_tag, "storage", fileName=file, coordinateSystem="LPS")
-        return self.add(tag, name, {"storage": storage, **(references or {})}, **attributes)
-
-    def file(self) -> bytes:
-        """The .mrml file."""
-        ElementTree.indent(self._root)
-        return ElementTree.tostring(self._root, encoding="UTF-8", xml_declaration=True)
+def _scene(nodes: list[Element]) -> bytes:
+    """A .mrml file."""
+    root = Element("MRML", version=SCENE_VERSION, userTags="")
+    root.extend(nodes)
+    indent(root)
+    return tostring(root, encoding="UTF-8", xml_declaration=True)
 
 
-FORMAT = Format(
-    suffixes=(".mrb",),
-    options=("times", "split", "points", *SURFACE_OPTIONS),
-    write=write,
-    holds="a sequence of meshes",
-)
+def _node(tag: str, number: int | str, name: str, attributes: Mapping[str, str], **references: Element) -> Element:
+    """A node of a scene.
+
+    Args:
+        tag: its class `vtkMRML...Node` without prefix and suffix.
+        number: among the nodes of its class; text: the tag of a node that replaces the one of that class and tag.
+        references: other nodes, by role.
+    """
+    special = {"singletonTag": number} if isinstance(number, str) else {}
+    if references:
+        special["references"] = "".join(f"{role}:{other.get('id')};" for role, other in references.items())
+    return Element(tag, {"id": f"vtkMRML{tag}Node{number}", "name": name, **attributes, **special})
+
+
+def _stored(played: Played, number: int, file: str, **references: Element) -> list[Element]:
+    """A node whose data is in `file`, relative to the scene's own, in LPS axes, after the node for its storage."""
+    storage = _node(played.storage, number, "storage", {"fileName": file, "coordinateSystem": "LPS"})
+    return [storage, _node(played.tag, number, played.name, {}, storage=storage, **references)]
+
+
+FORMAT = Format((".mrb",), ("times", "split", "points", *SURFACE_OPTIONS), write=write, holds="a sequence of meshes")

@@ -22,38 +22,37 @@ class TimeStep:
 
     name: str
     """Of its files, without suffix: the frame's index, or the position in --times, in six digits."""
-    time: float | None
-    """In [0, 1]; None is the canonical state."""
+    time: float = 0.0
+    """In [0, 1]."""
     frame: int | None = None
     """Index of the frame in the sequence, if it is one."""
+    canonical: bool = False
+    """The Gaussians as they are stored, before any motion; `time` is that of the first camera."""
 
     def splats(self, scene: Scene, axes: Axes) -> Splats:
-        """The Gaussians, activated, in `axes`."""
-        return splats_in_axes(canonical(scene) if self.time is None else scene.at(self.time), axes)
+        """The Gaussians, activated, in `axes`.
+
+        Raises:
+            InputError: the canonical state of several windows, each with Gaussians of its own.
+        """
+        if not self.canonical:
+            return splats_in_axes(scene.at(self.time), axes)
+        if len(scene.windows) > 1:
+            fix = "choose a time with --times, or export one window: RUN/windows/000."
+            raise input_error("--canonical", "a scene of one window", f"{len(scene.windows)} windows", fix)
+        return splats_in_axes(scene.windows[0].scene.canonical(), axes)
 
     def plain_splats(self, scene: Scene, axes: Axes) -> Splats:
         """The Gaussians in `axes`, as other programs know them: one color each, fitted to what the camera sees."""
         return splats_in_axes(one_color(self.splats(scene, "opencv"), self.camera(scene)), axes)
 
     def camera(self, scene: Scene) -> Camera:
-        """The sequence's camera at this time; the first one for the canonical state."""
-        return scene.camera_at(self.time or 0.0)
+        """The sequence's camera at this time."""
+        return scene.camera_at(self.time)
 
     def facts(self) -> dict[str, Any]:
-        """What `index.json` says about it."""
-        return {"time": self.time} | ({} if self.frame is None else {"frame": self.frame})
-
-
-def canonical(scene: Scene) -> Splats:
-    """The Gaussians as they are stored, before any motion, activated.
-
-    Raises:
-        InputError: the scene has several windows, each with Gaussians of its own.
-    """
-    if len(scene.windows) > 1:
-        fix = "choose a time with --times, or export one window: RUN/windows/000."
-        raise input_error("--canonical", "a scene of one window", f"{len(scene.windows)} windows", fix)
-    return scene.windows[0].scene.canonical()
+        """What `index.json` says about it; the canonical state has no time."""
+        return {"time": None if self.canonical else self.time} | ({} if self.frame is None else {"frame": self.frame})
 
 
 def frame_indices(num_frames: int, split: Split, data: DataConfig) -> list[int]:
@@ -81,7 +80,7 @@ def selected_time_steps(scene: Scene, options: ExportOptions) -> list[TimeStep]:
     if options.canonical + bool(options.times) + (options.split != "video") > 1:
         raise input_error("--canonical, --times, --split", "one of them", "several", "leave the others out.")
     if options.canonical:
-        return [TimeStep("canonical", None)]
+        return [TimeStep("canonical", canonical=True)]
     if options.times:
         return [TimeStep(f"{k:06d}", time) for k, time in enumerate(options.times)]
     total = len(scene.cameras)

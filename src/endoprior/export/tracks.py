@@ -1,12 +1,11 @@
-"""Tracks of chosen material points over the whole sequence, as CSV and NPZ."""
+"""Tracks of chosen material points over the whole sequence, as CSV and NPZ. `P` points."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,8 @@ from .formats import ExportOptions, Format, Progress
 COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence")
 
 
-@dataclass(frozen=True)
-class QueryPoints:
-    """The points to track: `P` pixels."""
+class QueryPoints(NamedTuple):
+    """The points to track."""
 
     pixels: NDArray[np.float64]
     """(P, 2) x, y, px; pixel (0, 0) is centered at (0.5, 0.5)."""
@@ -50,16 +48,15 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         else:
             first = render_surface(scene, times[0], cameras[0], options.min_alpha)
             queries = grid_query_points(first, options.grid_px)
-        starts = back_projected(scene, queries, options.min_alpha)
-        carried = carry(scene, starts, queries.frames, times)
-        pixels = np.empty((len(times), len(starts), 2), np.float32)
-        visible = np.empty(pixels.shape[:2], bool)
+        carried = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
+        pixels = np.empty((*carried.confidence.shape, 2), np.float32)
+        visible = np.empty(carried.confidence.shape, bool)
         for i, camera in enumerate(cameras):
             surface = render_surface(scene, times[i], camera, options.min_alpha)
             mask = sequence.frame(i).tissue_mask if sequence else None
             pixels[i], visible[i] = project_visible(carried.positions[i], surface, mask)
             progress(i + 1, len(cameras))
-        positions = points_in_axes(carried.positions, options.frame)
+        positions = points_in_axes(carried.positions, options.axes)
         np.savez_compressed(
             folder / "tracks.npz",
             points=positions,
@@ -69,23 +66,20 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             times=np.array(times),
             start_frame=queries.frames,
             start_pixel=queries.pixels,
-            axes=np.array(options.frame),
+            axes=np.array(options.axes),
         )
-        table = _table(positions, pixels, visible, carried.confidence, times)
+        table = _table(positions, pixels, visible, carried.confidence)
         (folder / "tracks.csv").write_text(table, encoding="utf-8", newline="\n")
 
 
 def _sequence_of(scene: Scene, data: Path) -> FrameSequence:
-    """The sequence in the folder `data`.
-
-    Raises:
-        InputError: it cannot be read, or it is not the one of the scene.
-    """
-    sequence, camera = load_sequence(data, scored_data(scene.config.data)), scene.cameras[0]
-    own = sequence.camera(0)
-    want, got = (len(scene.cameras), camera.width, camera.height), (len(sequence), own.width, own.height)
+    """The sequence in the folder `data`; InputError if it cannot be read, or is not the one of the scene."""
+    sequence = load_sequence(data, scored_data(scene.config.data))
+    want, got = (
+        f"{num} frames of {camera.width}x{camera.height}"
+        for num, camera in ((len(scene.cameras), scene.cameras[0]), (len(sequence), sequence.camera(0)))
+    )
     if want != got:
-        want, got = ("{} frames of {}x{}".format(*size) for size in (want, got))
         raise input_error(data, want, got, "pass the sequence of the run.")
     return sequence
 
@@ -109,18 +103,15 @@ def read_query_points(file: Path, scene: Scene) -> QueryPoints:
         if not (0 <= x <= camera.width and 0 <= y <= camera.height and 0 <= frame < total):
             want = f"x in [0, {camera.width}], y in [0, {camera.height}], frame in 0..{total - 1}"
             raise input_error(file, want, f"{x:g}, {y:g}, {frame} for point {k}", "correct the row.")
-    return QueryPoints(np.array([row[:2] for row in rows]), np.array([row[2] for row in rows], np.intp))
+    x, y, frames = zip(*rows, strict=True)
+    return QueryPoints(np.column_stack([x, y]), np.array(frames, np.intp))
 
 
 def grid_query_points(surface: Surface, spacing: int) -> QueryPoints:
-    """Pixel centers of the first frame, `spacing` px apart, where a surface is all around.
-
-    Raises:
-        InputError: there is none.
-    """
-    rows, columns = (np.arange(spacing // 2, n, spacing) for n in surface.depth.shape)
-    row, column = (part.ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
-    pixels = np.column_stack([column + 0.5, row + 0.5])
+    """Pixel centers of the first frame, `spacing` px apart, where a surface is all around; InputError if none is."""
+    height, width = surface.depth.shape
+    rows, columns = np.mgrid[spacing // 2 : height : spacing, spacing // 2 : width : spacing]
+    pixels = np.column_stack([columns.ravel() + 0.5, rows.ravel() + 0.5])
     pixels = pixels[np.isfinite(depth_at(surface, pixels))]
     if not len(pixels):
         raise input_error("--grid-px", "a grid with points on tissue in the first frame", f"{spacing}", "lower it.")
@@ -128,34 +119,31 @@ def grid_query_points(surface: Surface, spacing: int) -> QueryPoints:
 
 
 def back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
-    """(P, 3) world positions of the query points, mm."""
+    """(P, 3) world positions of the query points, mm; InputError for one that shows no surface."""
     positions = np.empty((len(queries.pixels), 3))
     for frame in np.unique(queries.frames):
-        own = queries.frames == frame
-        camera = scene.cameras[frame]
-        surface = render_surface(scene, frame / len(scene.cameras), camera, min_alpha)
+        own = np.flatnonzero(queries.frames == frame)
+        surface = render_surface(scene, frame / len(scene.cameras), scene.cameras[frame], min_alpha)
         depth = depth_at(surface, queries.pixels[own])
         if not np.isfinite(depth).all():
-            point = np.flatnonzero(own)[np.flatnonzero(~np.isfinite(depth))[0]]
+            point = own[np.isnan(depth).argmax()]
             x, y = queries.pixels[point]
             got = f"({x:g}, {y:g}) in frame {frame} for point {point}, where no surface is rendered"
             raise input_error("--points", "pixels that show tissue", got, "move it.")
-        positions[own] = back_project(queries.pixels[own], depth, camera)
+        positions[own] = back_project(queries.pixels[own], depth, scene.cameras[frame])
     return positions
 
 
-def _table(positions: NDArray, pixels: NDArray, visible: NDArray, confidence: NDArray, times: list[float]) -> str:
+def _table(positions: NDArray, pixels: NDArray, visible: NDArray, confidence: NDArray) -> str:
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)
-    for i, time in enumerate(times):
-        for p in range(positions.shape[1]):
-            x, y, z = (f"{value:.4f}" for value in positions[i, p])
-            u, v = (f"{value:.3f}" if math.isfinite(value) else "" for value in pixels[i, p])
-            rows.writerow((i, f"{time:.6f}", p, x, y, z, u, v, int(visible[i, p]), f"{confidence[i, p]:.3f}"))
+    for i, p in np.ndindex(visible.shape):
+        xyz = (f"{value:.4f}" for value in positions[i, p])
+        uv = (f"{value:.3f}" if np.isfinite(value) else "" for value in pixels[i, p])
+        time, shown = f"{i / len(visible):.6f}", int(visible[i, p])
+        rows.writerow((i, time, p, *xyz, *uv, shown, f"{confidence[i, p]:.3f}"))
     return text.getvalue()
 
 
-FORMAT = Format(
-    suffixes=(), options=("frame", "points", "grid_px", "min_alpha", "data"), write=write, holds="tracks of points"
-)
+FORMAT = Format((), ("frame", "points", "grid_px", "min_alpha", "data"), write=write, holds="tracks of points")

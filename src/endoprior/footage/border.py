@@ -1,6 +1,5 @@
-"""Where the endoscope image ends: straight and round borders of one clip together, and black parts.
-
-Shared letters: `K` sample images of one clip, (H, W, 3) uint8 each, at different times.
+"""Where the endoscope image ends: straight and round borders of one clip together, and black parts. Images are K
+samples of the clip, (H, W, 3), at different times.
 """
 
 from __future__ import annotations
@@ -12,37 +11,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .dark_outline import Circle, Darkness, brightness, find_darkness, reduced
+from .components import Image, Mask, components, distance_inside, grown, regions_where, square
+from .dark_outline import Circle, Darkness, blurred, brightness, find_darkness, reduced
 from .round_border import find_circle
 
 __all__ = ["Circle", "Outline", "Strips", "black_margin", "find_circle", "find_outline", "find_strips", "masked_border"]
 
-BLACK_LEVEL = 28
-"""Levels 0..255 below this are black, including limited-range video with coding noise."""
-MIN_STRIP_PX = 3
-"""Thinner strips are ignored; they can be coding noise."""
-MAX_STRIP_FRACTION = 0.25
-"""Largest share of the image for one strip."""
-STATIC_RATIO = 0.3
-"""The change over time of a strip is below this share of the change in the image center ..."""
-STRIP_CHROMA = 40
-"""... and a strip is gray: the channels of half of its pixels differ by less than this."""
+BLACK_LEVEL = 28  # Levels 0..255 below this are black, including limited-range video with coding noise
+MIN_STRIP_PX = 3  # Thinner strips are ignored; they can be coding noise
+MAX_STRIP_FRACTION = 0.25  # Largest share of the image for one strip
+STATIC_RATIO = 0.3  # The change over time of a strip is below this share of the change in the image center ...
+STRIP_CHROMA = 40  # ... and a strip is gray: the channels of half of its pixels differ by less than this.
 EDGE_SHARE, EDGE_STEP = 0.55, 12
 """Share of a strip's edge with a brightness step, and its least levels: unlike that of a shadow, it is straight."""
 FADING, MOST_FADING_PX = 0.8, 3
 """So many rows next to a strip belong to it if they have less than this share of the level two rows further inside."""
 MARGIN_LEVEL, MARGIN_AREA = 20, 0.001
 """The margin of a rectification is darker than this level, and covers at least this share of the image."""
-SHARP_PX = 4
-"""Beside a black part the image begins within this length, px; dark tissue becomes brighter gradually."""
+SHARP_PX = 4  # Beside a black part the image begins within this length, px; dark tissue becomes brighter gradually
 MARGIN_SHARP, ARC_SHARP = 0.3, 0.6
 """Share of the outline on which it does: of a margin, and of a black part of a circle."""
-MARGIN_GROW_PX, ARC_GROW_PX = 2, 3
-"""So much more is left out: interpolation and coding darken or blur the outline."""
-ARC_LENGTH = 3
-"""A black part of a circle is so many times longer along the border than deep; a dark tool is not."""
-FRAME_PX = 3
-"""Width of the black frame around the image while a margin is searched."""
+MARGIN_GROW_PX, ARC_GROW_PX = 2, 3  # So much more is left out: interpolation and coding darken or blur the outline
+ARC_LENGTH = 3  # A black part of a circle is so many times longer along the border than deep; a dark tool is not
+FRAME_PX = 3  # Width of the black frame around the image while a margin is searched
 
 
 @dataclass(frozen=True)
@@ -64,13 +55,11 @@ class Outline:
 
     strips: Strips
     circle: Circle | None
-    in_strip: NDArray[np.bool_]
-    """(H, W) True in the strips."""
-    outside: NDArray[np.bool_]
-    """(H, W) True outside of the circle, on its rim, and on black parts inside of it."""
+    in_strip: Mask  # (H, W) True in the strips
+    outside: Mask  # (H, W) True outside of the circle, on its rim, and on black parts inside of it
 
 
-def find_outline(images: Sequence[NDArray[np.uint8]]) -> Outline:
+def find_outline(images: Sequence[Image]) -> Outline:
     """Detect strips and a round border in (H, W, 3) sample images."""
     height, width = images[0].shape[:2]
     circle = find_circle(images)
@@ -83,27 +72,17 @@ def find_outline(images: Sequence[NDArray[np.uint8]]) -> Outline:
     return Outline(strips, circle, in_strip, outside)
 
 
-def masked_border(
-    outline: Outline, images: Sequence[NDArray[np.uint8]], tissue_masks: Iterable[NDArray[np.bool_]]
-) -> NDArray[np.bool_]:
-    """(H, W) True where no frame is tissue and no image shows anything: black, or beyond the outline.
-
-    Args:
-        images: sample images, (H, W, 3).
-        tissue_masks: (H, W) each, of every frame.
-    """
+def masked_border(outline: Outline, images: Sequence[Image], tissue_masks: Iterable[Mask]) -> Mask:
+    """(H, W) True where no frame is tissue, and no sample image shows anything: black, or beyond the outline."""
     masked = outline.in_strip | outline.outside | (np.maximum.reduce(images).max(-1) < BLACK_LEVEL)
     for tissue in tissue_masks:
         masked &= ~tissue
     return masked
 
 
-def find_strips(images: Sequence[NDArray[np.uint8]], circle: Circle | None = None) -> Strips:
-    """Detect black bars and static gray console strips at the sides.
-
-    Args:
-        images: K of one size; from a single image only black bars are detected.
-        circle: round border; what lies outside of it is no strip and hides none.
+def find_strips(images: Sequence[Image], circle: Circle | None = None) -> Strips:
+    """Detect black bars and static gray console strips at the sides; of a single image only black bars. What lies
+    outside of the circle is no strip and hides none.
     """
     grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
     mean = sum(grays) / len(grays)
@@ -113,22 +92,16 @@ def find_strips(images: Sequence[NDArray[np.uint8]], circle: Circle | None = Non
     height, width = brightest.shape
     central_change = float(np.median(change[height // 4 : height - height // 4, width // 4 : width - width // 4]))
     inside = circle.mask(width, height, circle.margin_px) if circle else np.ones((height, width), bool)
+    maps = brightest, chroma, change, mean, inside
     top, bottom, right, left = (  # turned so that the side in question is on top
-        _strip_on_top(*(np.rot90(m, turns) for m in (brightest, chroma, change, mean, inside)), central_change)
-        for turns in (0, 2, 1, 3)
+        _strip_on_top([np.rot90(each, turns) for each in maps], central_change) for turns in (0, 2, 1, 3)
     )
     return Strips(top, bottom, left, right)
 
 
-def _strip_on_top(
-    brightest: NDArray[np.uint8],
-    chroma: NDArray,
-    change: NDArray,
-    mean: NDArray,
-    inside: NDArray[np.bool_],
-    central_change: float,
-) -> int:
+def _strip_on_top(maps: list[NDArray], central_change: float) -> int:
     """Number of rows of a strip at the top of these (H, W) maps, 0 for none."""
+    brightest, chroma, change, mean, inside = maps
     limit = int(MAX_STRIP_FRACTION * len(brightest))
     first = int(inside.any(1).argmax())  # rows above show nothing of the circle
     rows = first
@@ -143,80 +116,65 @@ def _strip_on_top(
         return 0
     # A row of coding noise can lie between strip and image.
     jumps = [
-        np.abs(mean[rows + d] - mean[rows - 1])[inside[rows - 1] & inside[rows + d]] > EDGE_STEP
-        for d in (0, 1)
-        if rows + d < len(mean)
+        np.abs(mean[row] - mean[rows - 1])[inside[rows - 1] & inside[row]] > EDGE_STEP
+        for row in range(rows, min(rows + 2, len(mean)))
     ]
     if max((jump.mean() for jump in jumps if jump.size), default=0.0) <= EDGE_SHARE:
         return 0
-    level = [
-        float(np.median(row[at])) if at.any() else 0.0
-        for row, at in zip(mean[rows : rows + 6], inside[rows : rows + 6], strict=True)
-    ]
+    beside = slice(rows, rows + 6)
+    level = [np.median(row[at]) if at.any() else 0.0 for row, at in zip(mean[beside], inside[beside], strict=True)]
     fading = 0
     while fading < min(MOST_FADING_PX, len(level) - 3) and level[fading] < FADING * level[fading + 2]:
         fading += 1
     return rows + fading
 
 
-def black_margin(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_]:
-    """(H, W) True on the black margin that rectification leaves around an image.
-
-    It has no color at all, in all of the K images, touches the image's edge, and ends sharply.
-    """
+def black_margin(images: Sequence[Image]) -> Mask:
+    """(H, W) True on the black margin of a rectification: without color in all images, at the edge, sharp."""
     # A black frame around the image joins the regions of its sides, and keeps narrow ones.
-    grays = [cv2.copyMakeBorder(brightness(image), *4 * (FRAME_PX,), cv2.BORDER_CONSTANT) for image in images]
-    grays = [cv2.blur(gray, (3, 3)) for gray in grays]
+    grays = [blurred(np.pad(brightness(image), FRAME_PX)) for image in images]
     inner = (slice(FRAME_PX, -FRAME_PX),) * 2
     none = np.zeros(images[0].shape[:2], bool)
     darkness = find_darkness([gray[inner] for gray in grays])
     if darkness is None or darkness.level >= MARGIN_LEVEL:
         return none
     black, lit = _black_and_lit(np.maximum.reduce(grays), darkness)
-    _, regions = cv2.connectedComponents(black, connectivity=4)
-    margin = (regions == regions[0, 0]).astype(np.uint8)
+    regions, _ = components(black, 4)
+    margin = regions == regions[0, 0]
     if margin[inner].mean() < MARGIN_AREA:
         return none
-    outline = (cv2.dilate(margin, _square(1)) > margin)[inner]
+    outline = (grown(margin, square(1)) & ~margin)[inner]
     if not outline.any() or lit[inner][outline].mean() < MARGIN_SHARP:
         return none
-    return cv2.dilate(margin[inner], _square(MARGIN_GROW_PX)) > 0
+    return grown(margin[inner], square(MARGIN_GROW_PX))
 
 
-def _black_arcs(images: Sequence[NDArray[np.uint8]], circle: Circle) -> NDArray[np.bool_]:
-    """(H, W) True on black parts of the circle, where the picture ends before it does.
-
-    They are black in all of the K images, begin at the border or the image's edge, and end sharply.
+def _black_arcs(images: Sequence[Image], circle: Circle) -> Mask:
+    """(H, W) True on black parts of the circle, where the picture ends before it does: black in all images, they begin
+    at the border or the image's edge, and end sharply.
     """
-    grays = [cv2.blur(brightness(image), (3, 3)) for image in images]
+    grays = [blurred(brightness(image)) for image in images]
     height, width = grays[0].shape
     darkness = find_darkness(reduced(grays)[0])
     if darkness is None:
         return np.zeros((height, width), bool)
     inside = circle.mask(width, height, circle.margin_px)
     black, lit = _black_and_lit(np.maximum.reduce(grays), darkness, inside)
-    count, regions = cv2.connectedComponents(black, connectivity=4)
-    framed = np.pad(inside.astype(np.uint8), 1)  # the edge of the image cuts the circle
-    distance = cv2.distanceTransform(framed, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    inner = (cv2.erode(black, _square(1)) == 0) & (black > 0) & (distance > SHARP_PX)
-    depth = np.zeros(count, np.float32)
-    np.maximum.at(depth, regions[black > 0], distance[black > 0])
-    contact = np.bincount(regions[(black > 0) & (distance < 1.5)], minlength=count)
-    outline = np.bincount(regions[inner], minlength=count)
-    sharp = np.bincount(regions[inner & lit], minlength=count)
+    regions, boxes = components(black, 4)
+    distance = distance_inside(np.pad(inside, 1))[1:-1, 1:-1]  # the edge of the image cuts the circle
+    # The outline is where a black pixel has one beside it that is not; near the border that says nothing.
+    outer = black & grown(~black, square(1)) & (distance > SHARP_PX)
+    depth = np.zeros(len(boxes), np.float32)
+    np.maximum.at(depth, regions[black], distance[black])
+    contact, outline, sharp = (
+        np.bincount(regions[where], minlength=len(boxes)) for where in (black & (distance < 1.5), outer, outer & lit)
+    )
     chosen = (contact > ARC_LENGTH * depth) & (outline > 0) & (sharp >= ARC_SHARP * outline)
-    chosen[0] = False
-    return (cv2.dilate(chosen[regions].astype(np.uint8), _square(ARC_GROW_PX)) > 0) & inside
+    return grown(regions_where(chosen, regions), square(ARC_GROW_PX)) & inside
 
 
-def _black_and_lit(
-    brightest: NDArray[np.uint8], darkness: Darkness, inside: NDArray[np.bool_] | bool = True
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """(H, W) 1 on black pixels `inside`, without specks; (H, W) True within `SHARP_PX` of lit ones."""
+def _black_and_lit(brightest: Image, darkness: Darkness, inside: Mask | bool = True) -> tuple[Mask, Mask]:
+    """(H, W) True on black pixels `inside`, without specks; (H, W) True within `SHARP_PX` of lit ones."""
     black = ((brightest <= darkness.level + darkness.step) & inside).astype(np.uint8)
-    lit = cv2.dilate(brightest, _square(SHARP_PX)) > darkness.level + 4 * darkness.step
-    return cv2.morphologyEx(black, cv2.MORPH_OPEN, _square(1)), lit
-
-
-def _square(reach: int) -> NDArray[np.uint8]:
-    return np.ones((2 * reach + 1,) * 2, np.uint8)
+    lit = cv2.dilate(brightest, square(SHARP_PX)) > darkness.level + 4 * darkness.step
+    return cv2.morphologyEx(black, cv2.MORPH_OPEN, square(1)) > 0, lit

@@ -1,7 +1,7 @@
 """Detect changes that tissue motion does not cause: duplicates, exposure jumps, cuts, blur, views outside the body.
 
-Also combed images, of an interlaced video that its file does not flag as such. Shared letters: `T` successive images of
-one clip. Changes are measured on thumbnails, which suppresses noise.
+Also combed images, of an interlaced video that its file does not flag as such. `T` successive images of one clip.
+Changes are measured on thumbnails, which suppresses noise.
 """
 
 from __future__ import annotations
@@ -14,57 +14,47 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-THUMB_WIDTH = 160
-"""Images are compared at this width, px."""
-SAME_LEVELS = 0.03
-"""Images with a smaller mean difference, in levels of 255, are duplicates."""
+from .components import Image, Mask
+
+THUMB_WIDTH = 160  # Images are compared at this width, px
+SAME_LEVELS = 0.03  # Images with a smaller mean difference, in levels of 255, are duplicates
 COPY_LEVELS, COPY_SHARE = 0.12, 0.08
 """After video coding, so are images with a mean difference below this, if it is also below this share of the usual
 difference around them. A static scene changes by at least 0.15 levels."""
-JUMP = 0.13
-"""Smallest exposure jump: change of the logarithm of brightness (14 %) between two images."""
-JUMP_RATIO = 6.0
-"""An exposure jump is this many times the usual change of brightness ..."""
+JUMP = 0.13  # Smallest exposure jump: change of the logarithm of brightness (14 %) between two images
+JUMP_RATIO = 6.0  # An exposure jump is this many times the usual change of brightness ...
 JUMP_AGREEMENT = 0.85
 """... and this share of the image changes in the same direction. A tool that enters darkens only a part."""
-CUT_CORRELATION = 0.4
-"""Successive images of one scene have a higher correlation."""
-BLUR_RATIO = 0.45
-"""An image is blurred if its sharpness is below this share of that of its neighbors."""
-NEIGHBORS = 5
-"""Number of images on each side that define the usual value."""
+CUT_CORRELATION = 0.4  # Successive images of one scene have a higher correlation
+BLUR_RATIO = 0.45  # An image is blurred if its sharpness is below this share of that of its neighbors
+NEIGHBORS = 5  # Number of images on each side that define the usual value
 COLOR_DISTANCE = 0.07
 """An image shows another scene if its mean red or green share differs by this from the median of the clip."""
+BLOCK_PX = 16
+LEAST_DIFFERENCE = 3.0  # Mean difference of neighboring rows, of 255, above which a block has structure
+RATIO = 1.3
+"""A block is combed if its neighboring rows differ more than rows two apart, by this factor; usually it is 0.55."""
+SHARE, LEAST_BLOCKS = 0.1, 8
+"""Least share of combed blocks, of those with structure. Progressive clips have up to 0.03, woven ones 0.07 to 1."""
+LEAST_IMAGES = 0.1  # Share of images that must be combed: without motion there is nothing to see
 
 
 @dataclass(frozen=True)
 class Changes:
     """Curves over the clip, and the positions, from 0, of conspicuous images."""
 
-    brightness: NDArray[np.float64]
-    """(T,) mean gray level in [0, 1]."""
-    difference: NDArray[np.float64]
-    """(T - 1,) mean absolute difference of successive thumbnails, levels of 255."""
-    sharpness: NDArray[np.float64]
-    """(T,) RMS of the Laplacian divided by brightness, > 0; comparable within one clip only."""
-    duplicates: tuple[int, ...]
-    """Images that repeat the one before."""
-    exposure_jumps: tuple[int, ...]
-    """Images that are suddenly brighter or darker than the one before."""
-    cuts: tuple[int, ...]
-    """Images that show another view than the one before."""
-    blurred: tuple[int, ...]
-    """Images much less sharp than their neighbors."""
-    off_color: tuple[int, ...]
-    """Images of another color than the clip: outside the body, or covered by smoke or blood."""
+    brightness: NDArray[np.float64]  # (T,) mean gray level in [0, 1]
+    difference: NDArray[np.float64]  # (T - 1,) mean absolute difference of successive thumbnails, levels of 255
+    sharpness: NDArray[np.float64]  # (T,) RMS of the Laplacian by brightness, > 0; comparable within one clip only
+    duplicates: tuple[int, ...]  # Images that repeat the one before
+    exposure_jumps: tuple[int, ...]  # Images that are suddenly brighter or darker than the one before
+    cuts: tuple[int, ...]  # Images that show another view than the one before
+    blurred: tuple[int, ...]  # Images much less sharp than their neighbors
+    off_color: tuple[int, ...]  # Images of another color than the clip: outside the body, or covered by smoke or blood
 
 
-def find_changes(images: Iterable[NDArray[np.uint8]]) -> Changes:
-    """Measure the curves and detect conspicuous images.
-
-    Args:
-        images: T of (H, W, 3) and of one size, in order, T >= 1; each is used once.
-    """
+def find_changes(images: Iterable[Image]) -> Changes:
+    """Measure the curves and detect conspicuous images, of T >= 1 images (H, W, 3) of one size; each is used once."""
     thumbs, sharpness, shares = [], [], []
     for image in images:
         size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * image.shape[0] / image.shape[1]))
@@ -72,13 +62,11 @@ def find_changes(images: Iterable[NDArray[np.uint8]]) -> Changes:
         thumbs.append(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
         shares.append(color_share(color))
         sharpness.append(_sharpness(image))
-    brightness = np.array([thumb.mean() for thumb in thumbs], np.float64) / 255
-    pairs = list(pairwise(thumbs))
+    pairs, sharp = list(pairwise(thumbs)), np.array(sharpness)
     difference = np.array([np.abs(now - before).mean() for before, now in pairs], np.float64)
-    cuts = tuple(i + 1 for i, (before, now) in enumerate(pairs) if _correlation(before, now) < CUT_CORRELATION)
-    sharp = np.array(sharpness)
+    cuts = tuple(i for i, pair in enumerate(pairs, 1) if _correlation(*pair) < CUT_CORRELATION)
     return Changes(
-        brightness,
+        np.array([thumb.mean() for thumb in thumbs], np.float64) / 255,
         difference,
         sharp,
         duplicates=find_duplicates(difference),
@@ -90,11 +78,7 @@ def find_changes(images: Iterable[NDArray[np.uint8]]) -> Changes:
 
 
 def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
-    """Positions of the images that repeat the one before.
-
-    Args:
-        difference: (T - 1,) mean absolute difference of successive images, levels of 255.
-    """
+    """Positions of the images that repeat the one before, from `Changes.difference`."""
     # A high percentile, not the median: half of the images are duplicates if the frame rate was doubled.
     usual = np.array([np.percentile(window, 80) for window in _windows(difference)])
     limit = np.maximum(SAME_LEVELS, np.minimum(COPY_LEVELS, COPY_SHARE * usual))
@@ -102,37 +86,31 @@ def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
 
 
 def _exposure_jumps(pairs: list[tuple[NDArray, NDArray]]) -> list[int]:
-    changes, agreements = [], []
-    for before, now in pairs:
-        small = [_reduced(thumb, 0.25) for thumb in (before, now)]
-        usable = (np.minimum(*small) > 8) & (np.maximum(*small) < 245)  # neither black nor saturated
-        if usable.mean() < 0.1:
-            changes.append(0.0)
-            agreements.append(0.0)
-            continue
-        ratio = np.log(small[1][usable] / small[0][usable])
-        changes.append(float(np.median(ratio)))
-        agreements.append(float(np.mean(np.sign(ratio) == np.sign(changes[-1]))))
-    usual = float(np.median(np.abs(changes))) if changes else 0.0
-    limit = max(JUMP, JUMP_RATIO * usual)
-    return [i + 1 for i, c in enumerate(changes) if abs(c) > limit and agreements[i] > JUMP_AGREEMENT]
+    changes, agreements = np.zeros((2, len(pairs)))
+    for i, pair in enumerate(pairs):
+        before, now = (_reduced(thumb, 0.25) for thumb in pair)
+        usable = (np.minimum(before, now) > 8) & (np.maximum(before, now) < 245)  # neither black nor saturated
+        if usable.mean() >= 0.1:
+            ratio = np.log(now[usable] / before[usable])
+            changes[i] = np.median(ratio)
+            agreements[i] = np.mean(np.sign(ratio) == np.sign(changes[i]))
+    limit = max(JUMP, JUMP_RATIO * float(np.median(np.abs(changes)))) if pairs else JUMP
+    return [i + 1 for i in _places((np.abs(changes) > limit) & (agreements > JUMP_AGREEMENT))]
 
 
-def _sharpness(image: NDArray[np.uint8]) -> float:
+def _sharpness(image: Image) -> float:
     """RMS of the Laplacian at half size, divided by brightness: exposure does not change it."""
     gray = _reduced(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 0.5)
     return float(cv2.Laplacian(gray, cv2.CV_32F).std() / max(float(gray.mean()), 1.0)) + 1e-6
 
 
 def _reduced(image: NDArray, share: float) -> NDArray:
-    """The image resized by a factor, to at least 1 px."""
     height, width = image.shape[:2]
     fx, fy = max(share, 1 / width), max(share, 1 / height)
     return cv2.resize(image, None, fx=fx, fy=fy, interpolation=cv2.INTER_AREA)
 
 
 def _windows(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
-    """Each value with its neighbors."""
     return [values[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(values))]
 
 
@@ -142,7 +120,7 @@ def color_share(image: NDArray) -> NDArray[np.float64]:
     return mean[:2] / max(mean.sum(), 1.0)
 
 
-def _places(found: NDArray[np.bool_]) -> tuple[int, ...]:
+def _places(found: Mask) -> tuple[int, ...]:
     return tuple(np.flatnonzero(found).tolist())
 
 
@@ -154,27 +132,16 @@ def _correlation(a: NDArray, b: NDArray) -> float:
     return 1.0 if energy < 1e-3 else float((a * b).mean()) / energy
 
 
-BLOCK_PX = 16
-LEAST_DIFFERENCE = 3.0
-"""Mean difference of neighboring rows, of 255, above which a block has structure."""
-RATIO = 1.3
-"""A block is combed if its neighboring rows differ more than rows two apart, by this factor; usually it is 0.55."""
-SHARE = 0.1
-"""Least share of combed blocks, of those with structure. Progressive clips have up to 0.03, woven ones 0.07 to 1."""
-LEAST_BLOCKS = 8
-LEAST_IMAGES = 0.1
-"""Share of images that must be combed: without motion there is nothing to see."""
-
-
-def is_combed(rgb_u8: NDArray[np.uint8]) -> bool:
+def is_combed(rgb_u8: Image) -> bool:
     """Whether moving parts of an image (H, W, 3) alternate from row to row."""
     gray = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    height, width = ((side - 2) // BLOCK_PX * BLOCK_PX for side in gray.shape)
-    if min(height, width) < BLOCK_PX:
+    rows, columns = ((side - 2) // BLOCK_PX for side in gray.shape)
+    if min(rows, columns) < 1:
         return False
+    height, width = rows * BLOCK_PX, columns * BLOCK_PX
     next_row, next_but_one = (
         np.abs(gray[by : height + by, :width] - gray[:height, :width])
-        .reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
+        .reshape(rows, BLOCK_PX, columns, BLOCK_PX)
         .mean((1, 3))
         for by in (1, 2)
     )
@@ -183,6 +150,6 @@ def is_combed(rgb_u8: NDArray[np.uint8]) -> bool:
     return bool(combed.sum() >= max(LEAST_BLOCKS, SHARE * structured.sum()))
 
 
-def are_combed(images: Sequence[NDArray[np.uint8]]) -> bool:
+def are_combed(images: Sequence[Image]) -> bool:
     """Whether images (H, W, 3) of a clip are those of an interlaced video."""
     return sum(map(is_combed, images)) > LEAST_IMAGES * len(images)

@@ -1,7 +1,4 @@
-"""First guess of a round border: the circle that most of the outline of dark regions lies on.
-
-Shared letters: `K` sample images of one clip, (H, W, 3) uint8 each; `P` outline points.
-"""
+"""First guess of a round border: the circle that most of the outline of dark regions lies on. `P` outline points."""
 
 from __future__ import annotations
 
@@ -13,117 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import spread
+from .components import Image, Mask, grown, large_regions, square
 
-WORKING_SIDE_PX = 640
-"""Larger images are reduced to this: the outline needs no more, and the circle is measured in full images later."""
-FEW = 9
-"""Number of images that tell what black is."""
-DARKEST_SHARE = 0.01
-"""A border covers at least this share of the image."""
-MOST_BLACK = 40
-"""A border is darker than this level."""
-LEAST_STEP = 4
-"""Smallest difference of levels between a border and the image."""
-LEAST_REGION = 0.001
-"""Smaller dark regions, as a share of the image, are ignored."""
+WORKING_SIDE_PX = 640  # Larger images are reduced for the first guess; the circle is measured in full images later
+FEW = 9  # Number of images that tell what black is
+DARKEST_SHARE = 0.01  # A border covers at least this share of the image
+MOST_BLACK = 40  # A border is darker than this level
+LEAST_STEP = 4  # Smallest difference of levels between a border and the image
+LEAST_REGION = 0.001  # Smaller dark regions, as a share of the image, are ignored
 LINE_SHARE = 0.2
 """An outline with this share of the image's width in one row, or of its height in one column, is a straight border."""
-Gray = NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class Darkness:
-    """What black means in a clip."""
-
-    level: float
-    """Median level of the darkest region, 0..255."""
-    step: float
-    """Levels above `level` that are not black; several standard deviations of the noise."""
-
-
-def brightness(image: NDArray[np.uint8]) -> Gray:
-    """(H, W) largest channel of an image (H, W, 3)."""
-    red, green, blue = cv2.split(image)
-    return cv2.max(cv2.max(red, green), blue)
-
-
-def reduced(grays: Sequence[Gray]) -> tuple[list[Gray], float]:
-    """Images with sides of at most `WORKING_SIDE_PX`, and the factor from their px to px of `grays`."""
-    height, width = grays[0].shape
-    factor = max(1.0, max(height, width) / WORKING_SIDE_PX)
-    if factor == 1:
-        return list(grays), 1.0
-    size = round(width / factor), round(height / factor)
-    return [cv2.resize(gray, size, interpolation=cv2.INTER_AREA) for gray in grays], width / size[0]
-
-
-def find_darkness(grays: Sequence[Gray]) -> Darkness | None:
-    """Level and noise of the darkest region of (H, W) images; None if it is too bright for a border."""
-    some = [grays[i] for i in spread(len(grays), FEW)]
-    smooth = np.stack([cv2.blur(gray, (3, 3)) for gray in some])
-    typical = np.partition(smooth, (len(smooth) - 1) // 2, axis=0)[(len(smooth) - 1) // 2]
-    darkest = float(np.quantile(typical, DARKEST_SHARE))
-    if darkest >= MOST_BLACK:
-        return None
-    dark = smooth[:, typical <= darkest + LEAST_STEP]
-    level = float(np.median(dark))
-    noise = 1.48 * float(np.median(np.abs(dark - level)))
-    return Darkness(level, float(np.clip(5 * noise, LEAST_STEP, MOST_BLACK)))
-
-
-def outline_points(grays: Sequence[Gray], darkness: Darkness) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points where (H, W) images become brighter than black, px, and unit vectors to the brighter side: (P, 2) each.
-
-    Straight borders along rows or columns are left out.
-    """
-    points, inward = [np.empty((0, 2))], [np.empty((0, 2))]
-    for gray in grays:
-        smooth = cv2.blur(gray, (3, 3))
-        dark = _large(smooth <= darkness.level + darkness.step)
-        edge = (cv2.dilate(dark, np.ones((3, 3), np.uint8)) > dark) & ~_lines(dark)
-        edge[:2] = edge[-2:] = edge[:, :2] = edge[:, -2:] = False
-        y, x = np.nonzero(edge)
-        if not len(x):
-            continue
-        wide = cv2.GaussianBlur(gray, (0, 0), 2).astype(np.float32)
-        slope = np.stack([cv2.Sobel(wide, cv2.CV_32F, *order)[y, x] for order in ((1, 0), (0, 1))], 1)
-        length = np.hypot(*slope.T)
-        steep = length > darkness.step
-        points.append(np.stack([x, y], 1)[steep] + 0.5)
-        inward.append((slope / np.maximum(length, 1e-6)[:, None])[steep].astype(np.float64))
-    return np.concatenate(points), np.concatenate(inward)
-
-
-def _large(dark: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """(H, W) 1 on the connected regions that are not small."""
-    _, regions, stats, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] >= LEAST_REGION * dark.size
-    large[0] = False
-    return large.astype(np.uint8)[regions]
-
-
-def _lines(dark: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W) True within 2 px of rows or columns along which a long part of the outline lies."""
-    found = np.zeros(dark.shape, bool)
-    for axis, lines in ((0, found), (1, found.T)):
-        changes = (np.diff(dark.astype(np.int8), axis=axis) != 0).sum(1 - axis)
-        for place in np.flatnonzero(changes > LINE_SHARE * dark.shape[1 - axis]):
-            lines[max(place - 2, 0) : place + 4] = True
-    return found
-
-
-HYPOTHESES = 6000
-"""Number of circles through three random points."""
-SCORED = 300
-"""Number of plausible ones to compare with all points."""
-MOST_POINTS = 1500
-"""Number of random points used for the comparison."""
-TOLERANCE = 0.012
-"""Distance from the circle, in radii, beyond which a point does not count."""
-FACING = 0.9
-"""Smallest cosine between the direction to the center and the direction in which the image becomes brighter."""
-UNMEASURED_RIM = 0.025
-"""Share of the radius that is left out of a circle whose rim was not measured."""
+HYPOTHESES = 6000  # Number of circles through three random points
+SCORED = 300  # Number of plausible ones to compare with all points
+MOST_POINTS = 1500  # Number of random points used for the comparison
+TOLERANCE = 0.012  # Distance from the circle, in radii, beyond which a point does not count
+FACING = 0.9  # Least cosine between the direction to the center and that in which the image becomes brighter
+UNMEASURED_RIM = 0.025  # Share of the radius that is left out of a circle whose rim was not measured
+Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -144,21 +47,88 @@ class Circle:
         """Width inside of the radius to leave out, px."""
         return UNMEASURED_RIM * self.radius if self.rim_px is None else self.rim_px
 
-    def mask(self, width: int, height: int, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    def mask(self, width: int, height: int, margin_px: float = 0.0) -> Mask:
         """(H, W) True inside the circle with its radius reduced by `margin_px`."""
         x = np.arange(width) + 0.5 - self.center_x
         y = np.arange(height)[:, None] + 0.5 - self.center_y
         return x * x + y * y < max(self.radius - margin_px, 0.0) ** 2
 
 
-def likely_circle(points: NDArray[np.float64], inward: NDArray[np.float64], width: int, height: int) -> Circle | None:
-    """The circle that most outline points lie on: random sample consensus, then a robust fit. Deterministic.
+@dataclass(frozen=True)
+class Darkness:
+    """What black means in a clip."""
 
-    Args:
-        points: (P, 2) x, y, px.
-        inward: (P, 2) unit vectors in which the image becomes brighter.
-        width, height: of the image, px.
-    """
+    level: float  # Median level of the darkest region, 0..255
+    step: float  # Levels above `level` that are not black; several standard deviations of the noise
+
+
+def brightness(image: Image) -> Image:
+    """(H, W) largest channel of an image (H, W, 3)."""
+    red, green, blue = cv2.split(image)
+    return np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
+
+
+def blurred(gray: Image) -> Image:
+    """(H, W) mean over 3x3 px."""
+    return np.asarray(cv2.blur(gray, (3, 3)), np.uint8)
+
+
+def reduced(grays: Sequence[Image]) -> tuple[list[Image], float]:
+    """Images with sides of at most `WORKING_SIDE_PX`, and the factor from their px to px of `grays`."""
+    height, width = grays[0].shape
+    factor = max(1.0, max(height, width) / WORKING_SIDE_PX)
+    if factor == 1:
+        return list(grays), 1.0
+    size = round(width / factor), round(height / factor)
+    small = [np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8) for gray in grays]
+    return small, width / size[0]
+
+
+def find_darkness(grays: Sequence[Image]) -> Darkness | None:
+    """Level and noise of the darkest region of (H, W) images; None if it is too bright for a border."""
+    smooth = np.stack([blurred(grays[i]) for i in spread(len(grays), FEW)])
+    typical = np.partition(smooth, (len(smooth) - 1) // 2, axis=0)[(len(smooth) - 1) // 2]
+    darkest = float(np.quantile(typical, DARKEST_SHARE))
+    if darkest >= MOST_BLACK:
+        return None
+    dark = smooth[:, typical <= darkest + LEAST_STEP]
+    level = float(np.median(dark))
+    noise = 1.48 * float(np.median(np.abs(dark - level)))
+    return Darkness(level, float(np.clip(5 * noise, LEAST_STEP, MOST_BLACK)))
+
+
+def outline_points(grays: Sequence[Image], darkness: Darkness) -> tuple[Points, Points]:
+    """(P, 2) points where images become brighter than black, px, and unit vectors inwards; no straight borders."""
+    points: list[Points] = [np.empty((0, 2))]
+    inward: list[Points] = [np.empty((0, 2))]
+    for gray in grays:
+        dark = large_regions(blurred(gray) <= darkness.level + darkness.step, LEAST_REGION * gray.size, 4)
+        edge = grown(dark, square(1)) & ~dark & ~_lines(dark)
+        edge[:2] = edge[-2:] = edge[:, :2] = edge[:, -2:] = False
+        y, x = np.nonzero(edge)
+        if not len(x):
+            continue
+        wide = cv2.GaussianBlur(gray, (0, 0), 2).astype(np.float32)
+        slope = np.stack([cv2.Sobel(wide, cv2.CV_32F, *order)[y, x] for order in ((1, 0), (0, 1))], 1)
+        length = np.hypot(*slope.T)
+        steep = length > darkness.step
+        points.append(np.stack([x, y], 1)[steep] + np.float64(0.5))
+        inward.append((slope / np.maximum(length, 1e-6)[:, None])[steep].astype(np.float64))
+    return np.concatenate(points), np.concatenate(inward)
+
+
+def _lines(dark: Mask) -> Mask:
+    """(H, W) True within 2 px of rows or columns along which a long part of the outline lies."""
+    found = np.zeros(dark.shape, bool)
+    for axis, lines in ((0, found), (1, found.T)):
+        changes = np.diff(dark, axis=axis).sum(1 - axis)
+        for place in np.flatnonzero(changes > LINE_SHARE * dark.shape[1 - axis]):
+            lines[max(place - 2, 0) : place + 4] = True
+    return found
+
+
+def likely_circle(points: Points, inward: Points, width: int, height: int) -> Points | None:
+    """(3,) center and radius of the circle that most points lie on: random sample consensus, then a robust fit."""
     if len(points) < 20:
         return None
     rng = np.random.default_rng(0)
@@ -179,10 +149,10 @@ def likely_circle(points: NDArray[np.float64], inward: NDArray[np.float64], widt
         if np.count_nonzero(weights) < 10:
             return None
         best = fit_circle(points, weights)
-    return Circle(*(float(v) for v in best)) if np.isfinite(best).all() else None
+    return best if np.isfinite(best).all() else None
 
 
-def fit_circle(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def fit_circle(points: Points, weights: NDArray[np.float64]) -> Points:
     """Center x, y and radius of the circle through (P, 2) points, by weighted linear least squares on x^2 + y^2."""
     middle = points.mean(0)
     moved = points - middle
@@ -192,7 +162,7 @@ def fit_circle(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDA
     return np.array([x + middle[0], y + middle[1], np.sqrt(max(c + x * x + y * y, 0.0))])
 
 
-def _circles_through(triples: NDArray[np.float64]) -> NDArray[np.float64]:
+def _circles_through(triples: Points) -> Points:
     """(N, 3) center and radius of the circles through (N, 3, 2) points; not finite for three points on a line."""
     origin = triples[:, 0]
     b, c = triples[:, 1] - origin, triples[:, 2] - origin
@@ -203,7 +173,7 @@ def _circles_through(triples: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.c_[x + origin[:, 0], y + origin[:, 1], np.hypot(x, y)]
 
 
-def _weights(circle: NDArray[np.float64], points: NDArray[np.float64], inward: NDArray[np.float64]) -> NDArray:
+def _weights(circle: Points, points: Points, inward: Points) -> NDArray[np.float64]:
     """(P,) 1 on the circle, falling to 0 at its tolerance; 0 where the image does not become brighter inwards."""
     to_center = circle[:2] - points
     distance = np.hypot(*to_center.T)

@@ -1,7 +1,8 @@
-"""Optical flow between two images: dense by inverse search (Kroeger et al. 2016), of corners by Lucas and Kanade.
+"""Optical flow between two images by OpenCV: dense by inverse search (Kroeger et al. 2016), of corners by Lucas and
+Kanade with pyramids (Bouguet 2001)."""
 
-Both are those of OpenCV; corners are followed by its pyramidal method (Bouguet 2001).
-"""
+# OpenCV's type stubs do not know that a start can be missing.
+# pyright: reportCallIssue=false, reportArgumentType=false
 
 from __future__ import annotations
 
@@ -11,18 +12,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-MIN_SIZE_PX = 32
-"""Smallest image side that dense inverse search supports."""
+from .components import Image, Mask
+
+MIN_SIZE_PX = 32  # Smallest image side that dense inverse search supports
 MOTION_S = 0.1
 """Time between two frames that show how tissue moves, s: long enough for a breath to move it by a pixel."""
 HALVED_FROM_PX = 256
 """Flow of frames with at least this shorter side is computed at half size: four times faster, almost as accurate."""
-FINE_SIDE_PX = 256
-"""Fine flow is computed on images shrunk by a whole number to at least this shorter side."""
+FINE_SIDE_PX = 256  # Fine flow is computed on images shrunk by a whole number to at least this shorter side
 
 
 def flow_shrink(height: int, width: int) -> int:
-    """Divisor of the image size for the flow: 2 for frames of at least `HALVED_FROM_PX`, else 1."""
+    """Divisor of the image size for the flow."""
     return 2 if min(height, width) >= HALVED_FROM_PX else 1
 
 
@@ -31,30 +32,28 @@ def fine_shrink(height: int, width: int) -> int:
     return max(1, min(height, width) // FINE_SIDE_PX)
 
 
-def gray_for_flow(rgb_u8: NDArray[np.uint8], shrink: int | None = None) -> NDArray[np.uint8]:
+def gray_for_flow(rgb_u8: Image, shrink: int | None = None) -> Image:
     """(h, w) gray image for the flow, from an (H, W, 3) frame; `shrink` by default that of `flow_shrink`."""
     height, width = rgb_u8.shape[:2]
     shrink = shrink or flow_shrink(height, width)
     gray = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY)
-    return cv2.resize(gray, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(gray, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def flow_pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Flow (h, w, 2) from the first (h, w) gray image to the second, and back, px; sides at least `MIN_SIZE_PX`."""
+def dense_flow(first: Image, second: Image) -> NDArray[np.float32]:
+    """Flow (h, w, 2) from the first (h, w) gray image to the second, px; bit-identical for any number of threads."""
+    return _estimator().calc(first, second, None)
+
+
+def flow_pair(first: Image, second: Image) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`dense_flow` from the first image to the second, and back."""
     estimator = _estimator()
-    forward = estimator.calc(first, second, None)
-    return forward, estimator.calc(second, first, None)
+    return estimator.calc(first, second, None), estimator.calc(second, first, None)
 
 
-def fine_flow(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], start: NDArray[np.float32] | None = None
-) -> NDArray[np.float32]:
-    """Flow to the second image as by `flow_pair`, but refined on the full image: twice as slow, half the error.
-
-    Larger steps between patches and fewer iterations than OpenCV's preset: half the time, the same error.
-
-    Args:
-        start: (h, w, 2) a guess to start from, such as the flow to the frame before `second`, px.
+def fine_flow(first: Image, second: Image, start: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    """`dense_flow` refined on the full image: twice as slow, half the error. Larger steps between patches and fewer
+    iterations than OpenCV's preset: half the time, the same error. `start` is a guess (h, w, 2), px.
     """
     estimator = _estimator()
     estimator.setFinestScale(0)
@@ -66,12 +65,12 @@ def fine_flow(
 
 def _estimator() -> cv2.DISOpticalFlow:
     """A new one for each pair: it keeps buffers, and a result must not depend on the previous pair."""
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
 
 def follow_both_ways(
-    first: NDArray[np.uint8],
-    second: NDArray[np.uint8],
+    first: Image,
+    second: Image,
     pixels: NDArray[np.float32],
     return_px: float,
     *,
@@ -79,19 +78,15 @@ def follow_both_ways(
     halvings: int = 3,
     guess: NDArray[np.float32] | None = None,
     criteria: tuple[int, int, float] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where the second image shows pixels of the first, and which of them the way back leads home.
+) -> tuple[NDArray[np.float32], Mask]:
+    """Where the second gray image shows pixels (N, 2) of the first, and (N,) False where the way back leads elsewhere.
 
     Args:
-        first, second: (H, W) gray images.
-        pixels: (N, 2) px, N > 0; pixel centers count from 0.
         return_px: followed back, x and y of a pixel come back within this distance, or it counts as lost.
         side_px: side of the window that is compared.
         halvings: how often the images are halved; it bounds the motion that is found.
         guess: (N, 2) where to start in the second image; without it at `pixels`.
         criteria: when the iteration ends, as OpenCV has it; None for its default.
-    Returns:
-        (N, 2) pixels of the second image, meaningless where lost, and (N,) False where lost.
     """
     options: dict[str, Any] = {"winSize": (side_px, side_px), "maxLevel": halvings}
     if criteria is not None:

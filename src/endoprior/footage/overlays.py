@@ -1,6 +1,5 @@
-"""Detect burned-in labels and console text: static regions of high contrast in a changing image.
-
-Returns their positions; the text itself is not read. Faint or changing text (a running clock) is not detected.
+"""Detect burned-in labels and console text: static regions of high contrast in a changing image. The text itself is not
+read. Faint or changing text (a running clock) is not detected.
 """
 
 from __future__ import annotations
@@ -12,37 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape
+from .components import Image, components, square
 
-LEAST_IMAGES = 5
-"""With fewer samples, static text cannot be detected."""
-LEAST_CONTRAST = 60
-"""Least contrast between text and background, levels 0..255."""
+LEAST_IMAGES = 5  # With fewer samples, static text cannot be detected
+LEAST_CONTRAST = 60  # Least contrast between text and background, levels 0..255
 STATIC = 0.035
 """The standard deviation over time of text is below this share of its contrast; that of moving edges is a third."""
-STATIC_SCENE = 0.3
-"""If more than this share of all edges is static, the scene itself is static and no text can be detected."""
-GAP = 0.025
-"""Letters closer together than this share of the image's height belong to one label."""
+STATIC_SCENE = 0.3  # If more than this share of all edges is static, the scene is, and no text can be detected
+GAP = 0.025  # Letters closer together than this share of the image's height belong to one label
 LEAST_PX, MOST_HEIGHT = 7, 0.2
 """Smallest side of a label, px, and its largest height, as a share of the image height. Edges of bars and consoles are
 thinner or longer."""
 LINE_ASPECT, BLOCK_SHARE = 1.5, 0.003
 """Least aspect ratio of a line of text, or least share of the image for a block. Highlights of a static camera have
 neither."""
-LEAST_FILL = 0.25
-"""Least share of the rectangle covered by strokes; on a round border or a static tool it is far less."""
+LEAST_FILL = 0.25  # Least share of the rectangle covered by strokes; on a round border or a static tool it is far less
 
 
-def find_static_overlays(images: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int, int, int]]:
-    """Rectangles around text that is burned into every image of a clip; distant words get separate rectangles.
+def find_static_overlays(images: Sequence[Image]) -> list[tuple[int, int, int, int]]:
+    """Rectangles x, y, width, height, px, around text that is burned into every image of a clip, from top to bottom.
 
-    Args:
-        images: (H, W, 3) each, 0..255, spread over the clip (about 20); fewer than 5 give no rectangles.
-    Returns:
-        (x, y, width, height) each, px, with a margin of about half a letter, from top to bottom. Empty for a static
-        scene.
-    Raises:
-        ValueError: images of unequal shapes.
+    The images (H, W, 3) are of one size and spread over the clip (about 20). Distant words get separate rectangles,
+    with a margin of about half a letter. None for a static scene, or fewer than `LEAST_IMAGES`.
     """
     if len(images) < LEAST_IMAGES:
         return []
@@ -62,9 +52,9 @@ def find_static_overlays(images: Sequence[NDArray[np.uint8]]) -> list[tuple[int,
     if static.sum() > STATIC_SCENE * any_edge.sum():
         return []
     gap = max(2, round(GAP * height / 2))
-    joined = cv2.morphologyEx(static.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * gap + 1, 2 * gap + 1), np.uint8))
+    joined = cv2.morphologyEx(static.astype(np.uint8), cv2.MORPH_CLOSE, square(gap)) > 0
     found = []
-    for x, y, w, h, _ in cv2.connectedComponentsWithStats(joined)[2][1:].tolist():
+    for x, y, w, h, _ in components(joined)[1][1:].tolist():
         strokes = static[y : y + h, x : x + w].mean()
         shaped = w >= LINE_ASPECT * h or w * h >= BLOCK_SHARE * width * height
         if min(w, h) >= LEAST_PX and h <= MOST_HEIGHT * height and shaped and strokes >= LEAST_FILL:
@@ -75,5 +65,4 @@ def find_static_overlays(images: Sequence[NDArray[np.uint8]]) -> list[tuple[int,
 
 def _contrast(gray: NDArray[np.float64]) -> NDArray[np.float64]:
     """(H, W) levels between the brightest and the darkest of the 5x5 px around each pixel."""
-    around = np.ones((5, 5), np.uint8)
-    return cv2.dilate(gray, around) - cv2.erode(gray, around)
+    return np.asarray(cv2.dilate(gray, square(2)) - cv2.erode(gray, square(2)), np.float64)

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.checks import check_shape
+from .components import Image, Mask
 
-LIT = 25
-"""Darker pixels (largest channel, 0..255) are ignored: they are outside a round border or in shadow."""
-LEAST_SHARE = 0.0005
-"""A region with a smaller share of the lit pixels counts as empty."""
+LIT = 25  # Darker pixels (largest channel, 0..255) are ignored: they are outside a round border or in shadow
+LEAST_SHARE = 0.0005  # A region with a smaller share of the lit pixels counts as empty
 AREA_WEIGHT, BORDER_WEIGHT = 4.0, 2.0
 """Log-odds per unit of area and border: 10 % of the area gives odds of 5 : 1 for tools, 40 % gives 1.5 : 1."""
 COLOR_WEIGHT, COLOR_LIMIT = 1.5, 3.0
@@ -24,24 +22,14 @@ COLOR_WEIGHT, COLOR_LIMIT = 1.5, 3.0
 class Polarity:
     """The value that marks tools, and the certainty of the detection."""
 
-    tool_is_high: bool
-    """True where values above half mark tools."""
-    certainty: float
-    """From 0 (unknown) to 1 (certain)."""
-    reason: str
-    """The measurements in one line."""
+    tool_is_high: bool  # True where values above half mark tools
+    certainty: float  # From 0 (unknown) to 1 (certain)
+    reason: str  # The measurements in one line
 
 
-def mask_polarity(highs: Sequence[NDArray[np.bool_]], images: Sequence[NDArray[np.uint8]]) -> Polarity:
-    """Detect which value of the masks marks tools.
-
-    Args:
-        highs: (H, W) each, True where the mask's value is above half.
-        images: (H, W, 3) each, 0..255, the frames of these masks; a dozen are enough.
-    Returns:
-        If one value does not occur: the rarer value marks tools, with certainty 0.
-    Raises:
-        ValueError: no frames, lists of unequal length, or shapes that do not match.
+def mask_polarity(highs: Sequence[Mask], images: Sequence[Image]) -> Polarity:
+    """Detect which value of the masks marks tools; if one does not occur, that one, with certainty 0. `highs` (H, W)
+    are True where the mask's value is above half, `images` (H, W, 3) their frames; a dozen are enough.
     """
     if not highs:
         raise ValueError("highs must hold at least one mask, got none")
@@ -69,11 +57,8 @@ def mask_polarity(highs: Sequence[NDArray[np.bool_]], images: Sequence[NDArray[n
     spread = np.median([np.median(np.abs(redness[side == v] - m)) for v, m in ((True, high_red), (False, low_red))])
     # 1.48 median absolute deviations are a standard deviation; 0.05 is the variation of gray between cameras.
     grayer = (low_red - high_red) / (1.48 * float(spread) + 0.05)
-    log_odds = (
-        AREA_WEIGHT * (0.5 - area)
-        + BORDER_WEIGHT * (0.5 - border)
-        + COLOR_WEIGHT * float(np.clip(grayer, -COLOR_LIMIT, COLOR_LIMIT))
-    )
+    by_color = COLOR_WEIGHT * float(np.clip(grayer, -COLOR_LIMIT, COLOR_LIMIT))
+    log_odds = AREA_WEIGHT * (0.5 - area) + BORDER_WEIGHT * (0.5 - border) + by_color
     reason = (
         f"high values cover {area:.0%} of the image and {border:.0%} of its border, "
         f"redness {high_red:.2f} against {low_red:.2f} elsewhere"

@@ -16,26 +16,20 @@ from numpy.typing import NDArray
 
 from ..core.geometry import CONVENTIONS, Convention, to_ours
 from ..core.ranges import spread
+from .components import Image, square
 from .optical_flow import follow_both_ways
 
-View = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
+View = tuple[Image, NDArray, NDArray[np.float32]]
 """Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""
-WORK_WIDTH = 320
-"""Wider images are resized to this width, px."""
-STARTS = 10
-"""Number of frames from which corners are followed."""
-REACH = 24
-"""... over so many frames at most ..."""
-FAR = 0.05
-"""... or until they have moved by this share of the image width (median)."""
+WORK_WIDTH = 320  # Wider images are resized to this width, px
+STARTS = 10  # Number of frames from which corners are followed
+REACH = 24  # ... over so many frames at most ...
+FAR = 0.05  # ... or until they have moved by this share of the image width (median).
 MAX_CORNERS, FEWEST = 200, 40
 RETURN_PX = 1.0
-EDGE_STEP = 0.05
-"""No corners where depth changes by more than this share between neighbors."""
-LEAST_PX = 1.0
-"""Errors below this, px of an image 640 px wide, come from corners and tissue: nothing is wrong."""
-AS_GOOD = 1.15
-"""Conventions whose errors differ by less than this factor are not told apart."""
+EDGE_STEP = 0.05  # No corners where depth changes by more than this share between neighbors
+LEAST_PX = 1.0  # Errors below this, px of an image 640 px wide, come from corners and tissue: nothing is wrong
+AS_GOOD = 1.15  # Conventions whose errors differ by less than this factor are not told apart
 NONE_PX, NONE_FIT = 3.0, ((1.05, 3.0), (0.6, 10.0))
 """Poses do not fit at all if their error is above the first, px, and above both multiples of one pair: of the error
 without motion, and of that of the best rigid motion. Tissue that moves makes the latter small and the error large."""
@@ -53,20 +47,13 @@ PLAIN_UNITS, SAME_UNIT = (1.0, 1000.0, 10.0, 1e-3, 0.1), 2.5
 class PoseFit:
     """How well poses explain the images. Errors are medians over corners, px of an image 640 px wide."""
 
-    given_px: float
-    """Error of the poses as given."""
-    still_px: float
-    """Error without any camera motion."""
-    rigid_px: float
-    """Error of the rigid motion that fits each pair of frames best: tissue deforms."""
-    moved_px: float
-    """Motion that the poses as given predict."""
-    best: Convention
-    """The convention that fits best ..."""
-    unit: float
-    """... with this length of a unit, as a multiple of the given one ..."""
-    best_px: float
-    """... and its error."""
+    given_px: float  # Error of the poses as given
+    still_px: float  # Error without any camera motion
+    rigid_px: float  # Error of the rigid motion that fits each pair of frames best: tissue deforms
+    moved_px: float  # Motion that the poses as given predict
+    best: Convention  # The convention that fits best ...
+    unit: float  # ... with this length of a unit, as a multiple of the given one ...
+    best_px: float  # ... and its error.
     as_good: tuple[Convention, ...] = ()
     """Others that fit as well with this unit: the camera moves too little to tell them apart."""
 
@@ -101,14 +88,38 @@ class _Tracks:
 
     first: int
     last: int
-    points: NDArray[np.float64]
-    """(N, 3) place in the first camera, mm."""
-    before: NDArray[np.float64]
-    """(N, 2) px there."""
-    after: NDArray[np.float64]
-    """(N, 2) px in the last frame."""
-    half: tuple[float, float]
-    """Half of the image's width and height, px."""
+    matrix: NDArray[np.float64]  # (3, 3) K, px
+    points: NDArray[np.float64]  # (N, 3) place in the first camera, mm
+    before: NDArray[np.float64]  # (N, 2) px there
+    after: NDArray[np.float64]  # (N, 2) px in the last frame
+    side: int  # Longer side of the image, px
+
+    def still(self) -> NDArray[np.float64]:
+        """(N,) how far the corners moved, px."""
+        return np.linalg.norm(self.after - self.before, axis=1)
+
+    def rigid(self) -> NDArray[np.float64]:
+        """(N,) distance from the followed corners after the rigid motion that explains most of them, px."""
+        nothing = np.zeros(0)
+        found, turn, shift, _ = cv2.solvePnPRansac(
+            self.points, self.after, self.matrix, nothing, reprojectionError=INLIER_PX
+        )
+        if not found:
+            return np.full(len(self.after), np.inf)
+        pixels, _ = cv2.projectPoints(self.points, turn, shift, self.matrix, nothing)
+        return np.linalg.norm(pixels[:, 0] - self.after, axis=1)
+
+    def errors(self, poses: NDArray[np.float64], goal: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """(N,) distance of the reprojected points from `goal`, by default the followed corners, px; at most the image's
+        size, which also counts behind the camera.
+        """
+        first, last = poses[self.first], poses[self.last]
+        world = self.points @ first[:3, :3].T + first[:3, 3]
+        there = (world - last[:3, 3]) @ last[:3, :3]
+        ahead = there[:, 2] > 1e-6
+        pixels = (there @ self.matrix.T)[:, :2] / np.where(ahead, there[:, 2], 1)[:, None]
+        off = np.linalg.norm(pixels - (self.after if goal is None else goal), axis=1)
+        return np.where(ahead, np.minimum(off, self.side), self.side)
 
 
 def measure_poses(
@@ -120,29 +131,28 @@ def measure_poses(
     turn: NDArray[np.float64] | None = None,
     relative: bool = False,
 ) -> PoseFit | None:
-    """Compare all conventions of poses.
+    """Compare all conventions of poses; None if the poses do not move, or if too few corners can be followed.
 
     Args:
         view: reads frame i; few frames are read, in ascending order from each start.
         matrix: (3, 3) K, px; pixel centers count from 0.
-        poses: (T, 4, 4) as the file has them; the unit is that of the depth if it is right.
-        given: the convention in which they are read at present.
+        poses: (T, 4, 4) as the file has them, which is read as `given` at present.
         turn: (3, 3) rotation from the camera that the poses belong to, to that of the frames.
         relative: whether the unit of the depth is unknown, so that any unit of the poses is right.
-    Returns:
-        None if the poses do not move, or if too few corners can be followed.
     """
-    steps = np.abs(poses - poses[0]).max()
-    if len(poses) < 2 or steps < 1e-6:
+    if len(poses) < 2 or np.abs(poses - poses[0]).max() < 1e-6:
         return None
-    starts = spread(len(poses) - 1, STARTS)
     width = view(0)[0].shape[1]
     factor = min(1.0, WORK_WIDTH / width)
     px = 640 / (factor * width)
     matrix = np.diag([factor, factor, 1]) @ matrix + [[0, 0, (factor - 1) / 2], [0, 0, (factor - 1) / 2], [0, 0, 0]]
+    starts = spread(len(poses) - 1, STARTS)
     tracks = [found for i in starts if (found := _follow(lambda j: _small(view(j), factor), matrix, i, len(poses)))]
     if not tracks:
         return None
+
+    def median(errors: Callable[[_Tracks], NDArray[np.float64]]) -> float:
+        return px * float(np.median(np.concatenate([errors(each) for each in tracks])))
 
     def read(convention: Convention, unit: float) -> NDArray[np.float64]:
         ours = to_ours(poses, convention, unit)
@@ -152,67 +162,42 @@ def measure_poses(
 
     def error(convention: Convention, unit: float) -> float:
         ours = read(convention, unit)
-        return px * float(np.median(np.concatenate([_errors(each, matrix, ours) for each in tracks])))
+        return median(lambda each: each.errors(ours))
 
     fits: list[tuple[float, Convention, float]] = []
-    for convention in (given, *(each for each in CONVENTIONS if each != given)):
+    for convention in sorted(CONVENTIONS, key=lambda each: each != given):
         unit = _best_unit(partial(error, convention))
         fits.append((error(convention, unit), convention, unit))
-    as_given = fits[0][0] if relative else error(given, 1.0)
     least, best, unit = min(fits, key=lambda fit: fit[0])
-    others = tuple(name for at, name, of in fits if name != best and of == unit and at < AS_GOOD * least)
     ours = read(given, 1.0)
-    still, rigid, moved = (
-        px * float(np.median(np.concatenate(errors)))
-        for errors in (
-            [np.linalg.norm(each.after - each.before, axis=1) for each in tracks],
-            [_rigid_errors(each, matrix) for each in tracks],
-            [_errors(each, matrix, ours, each.before) for each in tracks],
-        )
+    return PoseFit(
+        given_px=fits[0][0] if relative else error(given, 1.0),
+        still_px=median(_Tracks.still),
+        rigid_px=median(_Tracks.rigid),
+        moved_px=median(lambda each: each.errors(ours, each.before)),
+        best=best,
+        unit=1.0 if relative else unit,
+        best_px=least,
+        as_good=tuple(name for at, name, of in fits if name != best and of == unit and at < AS_GOOD * least),
     )
-    return PoseFit(as_given, still, rigid, moved, best, 1.0 if relative else unit, least, others)
 
 
 def _best_unit(error: Callable[[float], float]) -> float:
-    """The length of a unit with the least error."""
     unit = min(SCALES.tolist(), key=error)
     plain = next((each for each in PLAIN_UNITS if 1 / SAME_UNIT < unit / each < SAME_UNIT), None)
     return plain or min((unit * FINER).tolist(), key=error)
 
 
-def _rigid_errors(tracks: _Tracks, matrix: NDArray) -> NDArray[np.float64]:
-    """(N,) distance from the followed corners after the rigid motion that explains most of them, px."""
-    found, turn, shift, _ = cv2.solvePnPRansac(tracks.points, tracks.after, matrix, None, reprojectionError=INLIER_PX)
-    if not found:
-        return np.full(len(tracks.after), np.inf)
-    pixels, _ = cv2.projectPoints(tracks.points, turn, shift, matrix, None)
-    return np.linalg.norm(pixels[:, 0] - tracks.after, axis=1)
-
-
-def _errors(
-    tracks: _Tracks, matrix: NDArray, camera_to_world: NDArray, pixels_there: NDArray | None = None
-) -> NDArray[np.float64]:
-    """(N,) distance of the reprojected points from the followed corners, px; the image's size behind the camera."""
-    goal = tracks.after if pixels_there is None else pixels_there
-    first, last = camera_to_world[tracks.first], camera_to_world[tracks.last]
-    world = tracks.points @ first[:3, :3].T + first[:3, 3]
-    there = (world - last[:3, 3]) @ last[:3, :3]
-    pixels = there @ matrix.T
-    ahead = there[:, 2] > 1e-6
-    far = 2 * max(tracks.half)
-    pixels = pixels[:, :2] / np.where(ahead, there[:, 2], 1)[:, None]
-    return np.where(ahead, np.minimum(np.linalg.norm(pixels - goal, axis=1), far), far)
-
-
 def _small(view: View, factor: float) -> View:
     """Gray image, tissue and depth of a frame at the working size."""
     rgb_u8, tissue, depth = view
-    gray = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY)
+    gray = np.asarray(cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY), np.uint8)
     if factor == 1:
         return gray, tissue, depth
     size = round(gray.shape[1] * factor), max(round(gray.shape[0] * factor), 1)
-    tissue, depth = (cv2.resize(of, size, interpolation=cv2.INTER_NEAREST) for of in (tissue.astype(np.uint8), depth))
-    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), tissue, depth
+    tissue = cv2.resize(tissue.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8), tissue, depth
 
 
 def _follow(view: Callable[[int], View], matrix: NDArray, start: int, count: int) -> _Tracks | None:
@@ -235,18 +220,17 @@ def _follow(view: Callable[[int], View], matrix: NDArray, start: int, count: int
         return None
     corners = before[kept].astype(np.float64)
     rays = np.concatenate([corners, np.ones((len(kept), 1))], 1) @ np.linalg.inv(matrix).T
-    z = _sampled(depth, before[kept]).astype(np.float64)
-    half = gray.shape[1] / 2, gray.shape[0] / 2
-    return _Tracks(start, last, rays * z[:, None], corners, pixels.astype(np.float64), half)
+    points = rays * _sampled(depth, before[kept]).astype(np.float64)[:, None]
+    return _Tracks(start, last, matrix, points, corners, pixels.astype(np.float64), max(gray.shape))
 
 
-def _corners(gray: NDArray[np.uint8], tissue: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.float32]:
+def _corners(gray: Image, tissue: NDArray, depth: NDArray[np.float32]) -> NDArray[np.float32]:
     """(N, 2) corners on smooth tissue with depth."""
-    near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
-    inner = cv2.erode(tissue.astype(np.uint8), np.ones((9, 9)), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    near, far = cv2.erode(depth, square(1)), cv2.dilate(depth, square(1))
+    inner = cv2.erode(tissue.astype(np.uint8), square(4), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     allowed = inner * ((near > 0) & (far - near < EDGE_STEP * depth)).astype(np.uint8)
     found = cv2.goodFeaturesToTrack(gray, MAX_CORNERS, 0.003, max(5, gray.shape[1] // 80), mask=allowed)
-    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2), np.float32)
 
 
 def _sampled(image: NDArray, pixels: NDArray[np.float32]) -> NDArray:

@@ -1,6 +1,5 @@
-"""What the right eye sees of the left picture, by measured depth: pure functions of NumPy arrays.
-
-A point at column x of the left image is at column x - disparity of the right one; disparity is fx baseline / z.
+"""What the right eye sees of the left picture, by measured depth. A point at column x of the left image is at column x
+- disparity of the right one; disparity is fx baseline / z, px, (H, W), and 0 where no depth was measured.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ from numpy.typing import NDArray
 
 from ..core.geometry import bilinear, pixel_centers
 from ..core.types import Camera, Frame
+from .components import Image, Mask
 
-STEEPEST = 1.0
-"""Neighbors of a row lie on one surface where their disparities differ by less than this, px per px."""
-NEAREST = 0.5
-"""A tool without depth may be as near as this share of the smallest measured depth of the frame."""
+STEEPEST = 1.0  # Neighbors of a row lie on one surface where their disparities differ by less than this, px per px
+NEAREST = 0.5  # A tool without depth may be as near as this share of the smallest measured depth of the frame
 
 
 def right_camera(camera: Camera, baseline_mm: float) -> Camera:
@@ -28,17 +26,10 @@ def right_camera(camera: Camera, baseline_mm: float) -> Camera:
 
 
 def warp_to_right(
-    rgb: NDArray[np.floating], disparity: NDArray[np.floating], tissue: NDArray[np.bool_]
-) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    """The left picture as the right eye sees it, on tissue that both eyes see.
-
-    Args:
-        rgb: (H, W, 3) left picture.
-        disparity: (H, W) of the left image, px; 0 where no depth was measured.
-        tissue: (H, W) True on tissue of the left image. All else hides what is behind it.
-    Returns:
-        (H, W, 3) right picture, read bilinearly from the left one, 0 where the pixel does not count; and (H, W) True
-        where it counts: both eyes see tissue there and in the 8 pixels around, where its depth was measured.
+    rgb: NDArray[np.floating], disparity: NDArray[np.floating], tissue: Mask
+) -> tuple[NDArray[np.floating], Mask]:
+    """The left picture (H, W, 3) as the right eye sees it, bilinear; and (H, W) which pixels count, 0 elsewhere. All
+    that is not tissue of the left image hides what is behind it.
     """
     seen, counted = seen_by_both(disparity, tissue)
     pixels = pixel_centers(disparity.shape[1], disparity.shape[0]).astype(np.float64)
@@ -46,21 +37,17 @@ def warp_to_right(
     return np.where(counted[..., None], bilinear(rgb, pixels), 0).astype(rgb.dtype), counted
 
 
-def seen_by_both(
-    disparity: NDArray[np.floating], tissue: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def seen_by_both(disparity: NDArray[np.floating], tissue: Mask) -> tuple[NDArray[np.float64], Mask]:
     """`right_disparity`, and (H, W) which of its pixels count: both eyes see tissue there and in the 8 pixels around.
-
-    Pixels on a silhouette mix the colors of two surfaces.
+    (Pixels on a silhouette mix the colors of two surfaces.)
     """
     seen = right_disparity(disparity, tissue)
     return seen, cv2.erode((seen > 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
 
 
 def measured_disparity(frame: Frame, baseline_mm: float) -> NDArray[np.float64]:
-    """(H, W) fx baseline / z, px; 0 without measured depth, and where depth was clipped when it was read.
-
-    Clipped depth is known by being the smallest or the largest of the frame. If all is equal, nothing was clipped.
+    """(H, W); 0 also where depth was clipped when it was read. Clipped depth is known by being the smallest or the
+    largest of the frame. If all is equal, nothing was clipped.
     """
     depth = np.where(frame.depth_valid, frame.depth, 0).astype(np.float64)
     measured = depth[depth > 0]
@@ -69,12 +56,8 @@ def measured_disparity(frame: Frame, baseline_mm: float) -> NDArray[np.float64]:
     return np.divide(frame.camera.fx * baseline_mm, depth, out=np.zeros_like(depth), where=depth > 0)
 
 
-def right_frame(frame: Frame, image_u8: NDArray[np.uint8], baseline_mm: float) -> Frame:
-    """The frame of the right eye: its picture, and as its tissue with depth what both eyes see.
-
-    Args:
-        image_u8: (H, W, 3) right picture.
-    """
+def right_frame(frame: Frame, image_u8: Image, baseline_mm: float) -> Frame:
+    """The frame of the right eye: its picture (H, W, 3), and as its tissue with depth what both eyes see."""
     seen, counted = seen_by_both(measured_disparity(frame, baseline_mm), frame.tissue_mask)
     depth = np.divide(frame.camera.fx * baseline_mm, seen, out=np.zeros_like(seen), where=counted)
     camera = right_camera(frame.camera, baseline_mm)
@@ -83,33 +66,26 @@ def right_frame(frame: Frame, image_u8: NDArray[np.uint8], baseline_mm: float) -
     )
 
 
-def right_disparity(disparity: NDArray[np.floating], tissue: NDArray[np.bool_]) -> NDArray[np.float64]:
+def right_disparity(disparity: NDArray[np.floating], tissue: Mask) -> NDArray[np.float64]:
     """(H, W) disparity of the tissue that both eyes see, at the pixel centers of the right image, px; 0 elsewhere.
 
     The left image's pixels are points of surfaces. Neighbors of a row on one surface are joined by a line, which is
     exact on planes; a point that is not joined to both sides covers the one pixel in which it lies. The nearest wins.
-    Tools without depth hide all that they may hide. Arguments as `warp_to_right`.
     """
     height, width = disparity.shape
-    left = np.arange(width) + 0.5
     near = disparity.astype(np.float64)
     nearest, seen = np.zeros((height, width)), np.zeros((height, width), bool)
-    samples = _samples(left, near, tissue)
-    for rows, columns, values, _ in samples:
-        np.maximum.at(nearest, (rows, columns), values)
+    rows, columns, values, of_tissue = _samples(near, tissue)
+    np.maximum.at(nearest, (rows, columns), values)
     for is_tissue in (True, False):  # a tool at the same depth hides the tissue
-        for rows, columns, values, of_tissue in samples:
-            won = (values == nearest[rows, columns]) & (of_tissue == is_tissue)
-            seen[rows[won], columns[won]] = is_tissue
+        won = (values == nearest[rows, columns]) & (of_tissue == is_tissue)
+        seen[rows[won], columns[won]] = is_tissue
     return np.where(seen & ~_maybe_hidden(near, tissue), nearest, 0)
 
 
-Samples = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]
-
-
-def _samples(left: NDArray[np.float64], near: NDArray[np.float64], tissue: NDArray[np.bool_]) -> list[Samples]:
+def _samples(near: NDArray[np.float64], tissue: Mask) -> list[NDArray]:
     """Row, column, disparity, and whether it is tissue, of all that may be seen at pixels of the right image."""
-    width, known = len(left), near > 0
+    left, known = np.arange(near.shape[1]) + 0.5, near > 0
     joined = known[:, :-1] & known[:, 1:] & (np.abs(np.diff(near, axis=1)) < STEEPEST)
     both = np.pad(joined, ((0, 0), (1, 0))) & np.pad(joined, ((0, 0), (0, 1)))
     rows, at = np.nonzero(known & ~both)
@@ -124,11 +100,12 @@ def _samples(left: NDArray[np.float64], near: NDArray[np.float64], tissue: NDArr
         on = center <= end
         whole = tissue[rows, at] & tissue[rows, at + 1]
         found.append((rows[on], (first + step)[on].astype(np.intp), values[on], whole[on]))
-    inside = [(columns >= 0) & (columns < width) for _, columns, _, _ in found]
-    return [tuple(part[keep] for part in sample) for sample, keep in zip(found, inside, strict=True)]
+    samples = [np.concatenate(parts) for parts in zip(*found, strict=True)]
+    inside = (samples[1] >= 0) & (samples[1] < len(left))
+    return [part[inside] for part in samples]
 
 
-def _maybe_hidden(near: NDArray[np.float64], tissue: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _maybe_hidden(near: NDArray[np.float64], tissue: Mask) -> Mask:
     """(H, W) True where the right eye may see a tool whose depth is unknown, in place of what is measured there.
 
     Such are the tool's pixels without depth, and the part of a tool that goes on beyond the right border of the left

@@ -1,9 +1,8 @@
 """Detect the round border of an endoscope image, though glare or dark tissue touches it and it moves a little.
 
-Outline points of all sample images vote for one circle. It is then measured along radial lines in every image, and
-rejected unless the images agree: the edge is sharp, on the circle, bent as the circle is, and its outside is dark.
-
-Shared letters: `K` sample images, `A` angles, `D` depths inside of the circle, px (negative outside).
+Outlines of the dark regions of all sample images vote for one circle (`dark_outline`). It is then measured along radial
+lines in every image, and rejected unless the images agree: the edge is sharp, on the circle, bent as the circle is, and
+its outside is dark. `K` sample images of one clip, (H, W); `A` angles; `D` depths inside of the circle, px.
 """
 
 from __future__ import annotations
@@ -16,45 +15,73 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .dark_outline import Circle, Darkness, brightness, find_darkness, likely_circle, outline_points, reduced
+from .components import Image, Mask
+from .dark_outline import Circle, Points, brightness, find_darkness, likely_circle, outline_points, reduced
 
-LEAST_AGREEMENT = 0.35
-"""Share of the visible circle on which the images show a border, if anything is lit there."""
-CERTAIN = 0.6
-"""Below this share, the border is uncertain, and only one with a sharp edge counts:"""
-SHARP = 0.55
-"""share of the level inside that is lost across a sharp edge, median."""
-LEAST_ARC_DEGREES = 40
-"""Sum of the arcs on which the images show a border."""
-LEAST_HITS = 0.25
-"""Share of the images that show an angle's border, of those that show anything there."""
-LEAST_OUTSIDE = 0.01
-"""Share of the image that a round border leaves dark."""
-MOST_MARGIN = 0.1
-"""Largest share of the radius for rim and movement together."""
+LEAST_AGREEMENT = 0.35  # Share of the visible circle on which the images show a border, if anything is lit there
+CERTAIN = 0.6  # Below this share, the border is uncertain, and only one with a sharp edge counts:
+SHARP = 0.55  # share of the level inside that is lost across a sharp edge, median
+LEAST_ARC_DEGREES = 40  # Sum of the arcs on which the images show a border
+LEAST_HITS = 0.25  # Share of the images that show an angle's border, of those that show anything there
+LEAST_OUTSIDE = 0.01  # Share of the image that a round border leaves dark
+MOST_MARGIN = 0.1  # Largest share of the radius for rim and movement together
 MOST_CONTRADICTION = 0.5
 """Largest ratio of angles with an edge beside the circle to angles with an edge on it: another outline crosses it."""
 MOST_UNEVEN = 0.5
 """Share of the tolerance within which four of five angles must lie: an ellipse fills the tolerance evenly."""
-MOST_LIT_OUTSIDE = 0.5
-"""Share of the outside that text and other displays may cover."""
-BEND = (0.6, 1.4)
-"""Bounds of the measured curvature of the border, in units of the circle's curvature; 0 is a straight line."""
-SHARED_ANGLES = 0.25
-"""Share of the angles whose errors are independent."""
-BEND_ERROR = 0.2
-"""Largest standard error of that curvature."""
+MOST_LIT_OUTSIDE = 0.5  # Share of the outside that text and other displays may cover
+BEND = (0.6, 1.4)  # Bounds of the border's curvature, in units of the circle's; 0 is a straight line
+SHARED_ANGLES = 0.25  # Share of the angles whose errors are independent
+BEND_ERROR = 0.2  # Largest standard error of that curvature
+ANGLES = 360
+SEARCH = (0.02, 0.01, 0.005)
+"""Standard deviation of the search around the circle, in radii: one round each, which reaches three times as far."""
+EDGE_WIDTH = 0.006  # Length over which levels are averaged on both sides of an edge, in radii
+LEAST_EDGE_PX = 1.5
+LEAST_CONTRAST = 0.4  # The level outside of an edge is lower by at least this share of the level inside
+DRIFT = 0.005  # Typical movement of the border in the image, in radii
+ANGLE_WEIGHT = 0.125  # Weight of one angle: neighbors have the same error
+LEAST_RIM, LEAST_RIM_PX = 0.005, 1.0  # Smallest rim, in radii and px
+MOST_RIM = 0.06  # Largest rim, in radii
+TISSUE = (0.06, 0.12)  # Depths, in radii, that show tissue in all endoscopes
+RADIAL = 1.6  # In a rim the level changes this many times more across the border than deeper in the image
+FADED = 0.7  # A rim is darker than this share of the level that tissue's own fall-off leads to
 
 
-def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
-    """Detect a round border, also one of which only arcs are visible.
+@dataclass(frozen=True)
+class Edges:
+    """The round border in every image."""
 
-    Args:
-        images: K of one size, (H, W, 3), at different times. Few images of a short time are enough if nothing hides
-            the border in all of them.
-    Returns:
-        The circle, subpixel, with the measured width of its rim and how far the images agree; None without a round
-        border. Vignetting, shadows, cut corners and black bars are no round border.
+    grays: Sequence[Image]
+    black: float  # Level of what is dark
+    step: float  # Levels above it that are not black
+    radius: float
+    centers: Points  # (K, 2) px
+    angles: NDArray[np.float64]  # (A,) radians; 0 points right, pi/2 down
+    error: NDArray[np.float64]
+    """(K, A) distance of the edge from the image's circle, px, positive outside; NaN without an edge."""
+    contrast: NDArray[np.float64]  # (K, A) share 0..1 of the level inside that is lost across the edge; NaN without one
+    visible: Mask  # (A,) True where the circle lies in the image
+
+    @property
+    def tolerance_px(self) -> float:
+        """Largest error of an edge that lies on the circle."""
+        return max(0.005 * self.radius, 1.5)
+
+    @property
+    def hits(self) -> Mask:
+        """(K, A) True where the edge lies on the circle."""
+        return np.abs(np.nan_to_num(self.error, nan=np.inf)) < self.tolerance_px
+
+    def profiles(self, depths: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(K, A, D) levels along radial lines."""
+        return _profiles(self.grays, self.centers, self.radius, self.angles, depths)
+
+
+def find_circle(images: Sequence[Image]) -> Circle | None:
+    """Detect a round border, also one of which only arcs are visible, in K images (H, W, 3) of one size. Few images of
+    a short time are enough if nothing hides the border in all of them. Vignetting, shadows, cut corners and black bars
+    are no round border.
     """
     grays = [brightness(image) for image in images]
     small, factor = reduced(grays)
@@ -65,83 +92,77 @@ def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
     start = likely_circle(*outline_points(small, darkness), width, height)
     if start is None:
         return None
-    start = Circle(start.center_x * factor, start.center_y * factor, start.radius * factor)
-    edges = _measure_edges(grays, start, darkness)
-    agreement = _agreement(edges, grays, small, factor, darkness)
-    if agreement is None or agreement < LEAST_AGREEMENT:
+    x, y, radius = start * factor
+    edges = _measure_edges(grays, x, y, radius, darkness.level, darkness.step)
+    agreement = _agreement(edges, small, factor)
+    if agreement < LEAST_AGREEMENT or (agreement < CERTAIN and np.median(edges.contrast[edges.hits]) < SHARP):
         return None
-    if agreement < CERTAIN and np.median(edges.contrast[edges.hits]) < SHARP:
-        return None
-    center, drift = _rest(edges)
-    rim = min(_measure_rim(grays, edges, darkness) + drift, MOST_MARGIN * edges.radius)
+    # Where the border rests, and how far it moves; images with few edges do not count.
+    shown = edges.hits.sum(1)
+    good = shown >= max(0.3 * np.quantile(shown, 0.9), 10)
+    centers = edges.centers[good] if good.any() else edges.centers
+    low, high = np.quantile(centers, [0.02, 0.98], axis=0)
+    center = (low + high) / 2
+    drift = float(np.quantile(np.hypot(*(centers - center).T), 0.98))
+    rim = min(_measure_rim(edges) + drift, MOST_MARGIN * edges.radius)
     return Circle(float(center[0]), float(center[1]), edges.radius, rim, agreement)
 
 
-def _agreement(
-    edges: Edges, grays: Sequence[NDArray], small: Sequence[NDArray], factor: float, darkness: Darkness
-) -> float | None:
-    """Share of the visible circle that shows a border where anything is lit; None if it cannot be a round border."""
-    height, width = grays[0].shape
-    center = edges.centers.mean(0)
+def _agreement(edges: Edges, small: Sequence[Image], factor: float) -> float:
+    """Share of the visible circle that shows a border where anything is lit; 0 if it cannot be a round border."""
+    height, width = edges.grays[0].shape
+    x, y = edges.centers.mean(0)
     plausible = 0.25 * min(width, height) < edges.radius < math.hypot(width, height)
-    if not plausible or not (0 < center[0] < width and 0 < center[1] < height):
-        return None
-    supported, silent = _support(edges, grays, darkness)
+    if not plausible or not (0 < x < width and 0 < y < height):
+        return 0.0
+    supported, silent = _support(edges)
     if supported.sum() * 360 / len(supported) < LEAST_ARC_DEGREES:
-        return None
-    if _contradicted(edges).sum() > MOST_CONTRADICTION * supported.sum():
-        return None
-    uneven = [abs(np.median(edges.error[edges.hits[:, a], a])) for a in np.flatnonzero(supported)]
-    partial = supported.sum() < 0.8 * edges.visible.sum()  # an outline that stays near the circle everywhere is one
-    if partial and np.quantile(uneven, 0.8) > MOST_UNEVEN * edges.tolerance_px:
-        return None
-    bend, error = _bend_of(edges, supported)
-    if not (BEND[0] < bend < BEND[1] and error < BEND_ERROR):
-        return None
-    wide = Circle(center[0] / factor, center[1] / factor, 1.02 * edges.radius / factor)
+        return 0.0
+    if _contradicted(edges).sum() > MOST_CONTRADICTION * supported.sum() or not _is_bent(edges, supported):
+        return 0.0
+    wide = Circle(x / factor, y / factor, 1.02 * edges.radius / factor)
     outside = ~wide.mask(small[0].shape[1], small[0].shape[0])
     if outside.mean() < LEAST_OUTSIDE:
-        return None
-    lit = np.median(np.stack(small)[:, outside], axis=0) > darkness.level + 2 * darkness.step
+        return 0.0
+    lit = np.median(np.stack(small)[:, outside], axis=0) > edges.black + 2 * edges.step
     if lit.mean() > MOST_LIT_OUTSIDE:
-        return None
+        return 0.0
     counted = edges.visible & (supported | ~silent)
     return float(supported.sum() / max(counted.sum(), 1))
 
 
-def _support(edges: Edges, grays: Sequence[NDArray], darkness: Darkness) -> tuple[NDArray, NDArray]:
+def _support(edges: Edges) -> tuple[Mask, Mask]:
     """(A,) True where enough images show the border; (A,) True where it is dark inside in all images."""
-    depths = np.linspace(0.01, 0.04, 7) * edges.radius
-    inner = _profiles(grays, edges.centers, edges.radius, edges.angles, depths)
+    inner = edges.profiles(np.linspace(0.01, 0.04, 7) * edges.radius)
     with np.errstate(invalid="ignore"):
-        lit = np.nan_to_num(inner).mean(2) > darkness.level + 2 * darkness.step
-    lit |= edges.hits
-    shown = lit.sum(0)
-    supported = edges.visible & (edges.hits.sum(0) >= np.maximum(LEAST_HITS * shown, 1)) & (shown > 0)
-    return supported, shown == 0
+        lit = np.nan_to_num(inner).mean(2) > edges.black + 2 * edges.step
+    shown = (lit | edges.hits).sum(0)
+    enough = edges.hits.sum(0) >= np.maximum(LEAST_HITS * shown, 1)
+    return edges.visible & enough & (shown > 0), shown == 0
 
 
-def _contradicted(edges: Edges) -> NDArray[np.bool_]:
+def _contradicted(edges: Edges) -> Mask:
     """(A,) True where half of the images show an edge in one place that is not on the circle."""
     error = np.where(edges.visible, edges.error, np.nan)
     shown = np.isfinite(error).mean(0) >= 0.5
-    found = np.zeros(len(edges.angles), bool)
     some = error[:, shown]
     middle = np.nanmedian(some, axis=0)
     spread = np.nanmedian(np.abs(some - middle), axis=0)
+    found = np.zeros(len(shown), bool)
     found[shown] = (np.abs(middle) >= edges.tolerance_px) & (spread < edges.tolerance_px)
     return found
 
 
-def _bend_of(edges: Edges, supported: NDArray[np.bool_]) -> tuple[float, float]:
-    """Curvature of the border in units of the circle's, and its standard error.
-
-    Each connected arc may have its own position and direction; only how it bends counts: 1 for the circle, 0 for the
-    straight sides of a polygon.
+def _is_bent(edges: Edges, supported: Mask) -> bool:
+    """Whether the border lies on the circle as an ellipse does not, and bends as the sides of a polygon do not. Each
+    arc may have its own position and direction; only how it bends counts, in units of the circle's curvature.
     """
     error = np.where(edges.hits, edges.error, np.nan)
     seen = np.flatnonzero(supported)
     values = np.array([np.nanmedian(error[:, a]) for a in seen])
+    partial = supported.sum() < 0.8 * edges.visible.sum()  # an outline that stays near the circle everywhere is one
+    if partial and np.quantile(np.abs(values), 0.8) > MOST_UNEVEN * edges.tolerance_px:
+        return False
     top = bottom = squares = 0.0
     freedom = 0
     for arc in _arcs(seen, len(supported)):
@@ -155,82 +176,26 @@ def _bend_of(edges: Edges, supported: NDArray[np.bool_]) -> tuple[float, float]:
         top, bottom = top + rest[:, 0] @ rest[:, 1], bottom + rest[:, 0] @ rest[:, 0]
         squares, freedom = squares + rest[:, 1] @ rest[:, 1], freedom + len(arc) - 2
     if bottom <= 0 or freedom < 3:
-        return math.nan, math.inf
+        return False
     straight = top / bottom
     variance = max(squares - straight * top, 0.0) / freedom + 0.05**2
-    return 1 - float(straight), float(np.sqrt(variance / bottom / SHARED_ANGLES))
+    bend, error = 1 - float(straight), math.sqrt(variance / bottom / SHARED_ANGLES)
+    return BEND[0] < bend < BEND[1] and error < BEND_ERROR
 
 
-def _arcs(seen: NDArray[np.int_], count: int) -> list[NDArray[np.int_]]:
-    """Positions in `seen` (sorted angles of `count`) of each arc without a gap of more than 3, and at least 6 long.
-
-    An arc is at most 30 angles long: many sides of a polygon would average out.
+def _arcs(seen: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
+    """Positions in `seen` (sorted angles of `count`) of each arc without a gap of more than 3, and at least 6 long; at
+    most 30 long, because many sides of a polygon would average out.
     """
-    if not len(seen):
-        return []
     gaps = np.diff(np.r_[seen, seen[0] + count])
-    start = (int(np.argmax(gaps)) + 1) % len(seen)
-    order = np.roll(np.arange(len(seen)), -start)
+    order = np.roll(np.arange(len(seen)), -(int(np.argmax(gaps)) + 1))
     steps = np.diff(seen[order]) % count
     parts = np.split(order, np.flatnonzero(steps > 3) + 1)
     parts = [piece for part in parts for piece in np.array_split(part, -(-len(part) // 30))]
     return [part for part in parts if len(part) >= 6]
 
 
-def _rest(edges: Edges) -> tuple[NDArray[np.float64], float]:
-    """Mean center, px, and the largest distance of an image's center from it; images with few edges do not count."""
-    shown = edges.hits.sum(1)
-    good = shown >= max(0.3 * np.quantile(shown, 0.9), 10)
-    centers = edges.centers[good] if good.any() else edges.centers
-    low, high = np.quantile(centers, [0.02, 0.98], axis=0)
-    center = (low + high) / 2
-    return center, float(np.quantile(np.hypot(*(centers - center).T), 0.98))
-
-
-ANGLES = 360
-SEARCH = (0.02, 0.01, 0.005)
-"""Standard deviation of the search around the circle, in radii: one round each, which reaches three times as far."""
-EDGE_WIDTH = 0.006
-"""Length over which levels are averaged on both sides of an edge, in radii."""
-LEAST_EDGE_PX = 1.5
-LEAST_CONTRAST = 0.4
-"""The level outside of an edge is lower by at least this share of the level inside."""
-DRIFT = 0.005
-"""Typical movement of the border in the image, in radii."""
-ANGLE_WEIGHT = 0.125
-"""Weight of one angle: neighbors have the same error."""
-
-
-@dataclass(frozen=True)
-class Edges:
-    """The round border in every image."""
-
-    radius: float
-    centers: NDArray[np.float64]
-    """(K, 2) px."""
-    angles: NDArray[np.float64]
-    """(A,) radians; 0 points right, pi/2 down."""
-    error: NDArray[np.float64]
-    """(K, A) distance of the edge from the image's circle, px, positive outside; NaN without an edge."""
-    contrast: NDArray[np.float64]
-    """(K, A) share 0..1 of the level inside that is lost across the edge; NaN without one."""
-    visible: NDArray[np.bool_]
-    """(A,) True where the circle lies in the image."""
-
-    @property
-    def tolerance_px(self) -> float:
-        """Largest error of an edge that lies on the circle."""
-        return max(0.005 * self.radius, 1.5)
-
-    @property
-    def hits(self) -> NDArray[np.bool_]:
-        """(K, A) True where the edge lies on the circle."""
-        return np.abs(np.nan_to_num(self.error, nan=np.inf)) < self.tolerance_px
-
-
-def _profiles(
-    grays: Sequence[NDArray[np.uint8]], centers: NDArray, radius: float, angles: NDArray, depths: NDArray
-) -> NDArray[np.float32]:
+def _profiles(grays: Sequence[Image], centers: Points, radius: float, angles: NDArray, depths: NDArray) -> NDArray:
     """(K, A, D) levels along radial lines of circles with (K, 2) centers; NaN outside of the image."""
     height, width = grays[0].shape
     found = np.empty((len(grays), len(angles), len(depths)), np.float32)
@@ -242,34 +207,35 @@ def _profiles(
     return found
 
 
-def _measure_edges(grays: Sequence[NDArray[np.uint8]], start: Circle, darkness: Darkness) -> Edges:
-    """Measure the circle in every full image (H, W), beginning with an approximate one.
-
-    The radius is that of all images. The center may move a little: lens and camera are not one piece.
+def _measure_edges(grays: Sequence[Image], x: float, y: float, start: float, black: float, dark_step: float) -> Edges:
+    """Measure the circle in every full image, from an approximate one of center x, y and radius `start`. The radius is
+    that of all images. The center may move a little: lens and camera are not one piece.
     """
-    angles = np.arange(ANGLES) * (2 * np.pi / ANGLES)
-    radius = start.radius
-    centers = np.repeat([[start.center_x, start.center_y]], len(grays), 0)
+    angles = np.arange(ANGLES) * np.float64(2 * np.pi / ANGLES)
+    radius, centers = float(start), np.repeat([[x, y]], len(grays), 0)
     for search in SEARCH:
         step = max(radius / 1000, 0.5)
         reach = 3 * search * radius + 2 * max(EDGE_WIDTH * radius, LEAST_EDGE_PX)
         depths = np.arange(-reach, reach, step)
         levels = _profiles(grays, centers, radius, angles, depths)
-        error, contrast = _edges(levels, depths, search * radius, radius, darkness)
+        error, contrast = _edges(levels, depths, search * radius, radius, black, dark_step)
         shift, grow = _moves(error, angles, radius)
         centers, radius = centers + shift, radius + grow
         error -= shift[:, :1] * np.cos(angles) + shift[:, 1:] * np.sin(angles) + grow
-        if not 0.1 * start.radius < radius < 2 * start.radius:
+        if not 0.1 * start < radius < 2 * start:
             break
     middle = np.argmin(np.abs(depths))
-    return Edges(radius, centers, angles, error, contrast, np.isfinite(levels[:, :, middle]).mean(0) > 0.5)
+    visible = np.isfinite(levels[:, :, middle]).mean(0) > 0.5
+    return Edges(grays, black, dark_step, radius, centers, angles, error, contrast, visible)
 
 
-def _edges(levels: NDArray, depths: NDArray, search_px: float, radius: float, darkness: Darkness) -> tuple:
+def _edges(
+    levels: NDArray, depths: NDArray, search_px: float, radius: float, black: float, dark_step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(K, A) distance of the edges outside of the circle, px, and their contrast; NaN where there is none."""
     step = depths[1] - depths[0]
     count = max(round(max(EDGE_WIDTH * radius, LEAST_EDGE_PX) / step), 1)
-    above = np.maximum(levels - darkness.level, 0)
+    above = np.maximum(levels - black, 0)
     sums = np.cumsum(np.nan_to_num(above), axis=2, dtype=np.float64)
     sums[np.isnan(levels)] = np.nan  # lines that leave the image have no edge there
     mean = (sums[:, :, count:] - sums[:, :, :-count]) / count
@@ -277,8 +243,8 @@ def _edges(levels: NDArray, depths: NDArray, search_px: float, radius: float, da
     at = depths[count : count + outer.shape[2]] + step / 2
     rise = inner - outer
     contrast = rise / np.maximum(inner, 1e-6)
-    score = rise / (inner + 2 * darkness.step) * np.exp(-0.5 * (at / search_px) ** 2)
-    score[~((rise > darkness.step) & (contrast > LEAST_CONTRAST))] = 0  # also where there is no number
+    score = rise / (inner + 2 * dark_step) * np.exp(-0.5 * (at / search_px) ** 2)
+    score[~((rise > dark_step) & (contrast > LEAST_CONTRAST))] = 0  # also where there is no number
     best = score.argmax(2)[:, :, None]
     found = np.take_along_axis(score, best, 2)[:, :, 0] > 0
     contrast = np.take_along_axis(contrast, best, 2)[:, :, 0]
@@ -291,14 +257,14 @@ def _edges(levels: NDArray, depths: NDArray, search_px: float, radius: float, da
 
 
 def _moves(error: NDArray, angles: NDArray, radius: float) -> tuple[NDArray[np.float64], float]:
-    """(K, 2) movement of each center and growth of the radius, px, that explain (K, A) errors; robust.
-
-    Least squares with Tukey's weights. Images that show little of the border stay near the mean center.
+    """(K, 2) movement of each center and growth of the radius, px, that explain (K, A) errors: least squares with
+    Tukey's weights. Images that show little of the border stay near the mean center.
     """
     count = len(error)
     columns = np.stack([np.cos(angles), np.sin(angles)], 1)
     shift, grow = np.zeros((count, 2)), 0.0
     known = np.isfinite(error)
+    values = np.where(known, error, 0.0)
     prior = (1.0 / max(DRIFT * radius, 0.5)) ** 2
     for _ in range(8):
         left = np.where(known, error - shift @ columns.T - grow, np.nan)
@@ -306,7 +272,6 @@ def _moves(error: NDArray, angles: NDArray, radius: float) -> tuple[NDArray[np.f
         weights = ANGLE_WEIGHT * np.where(known, np.maximum(1 - (left / scale) ** 2, 0) ** 2, 0.0)
         # Unknowns: 2 for each image, the radius, and the mean center.
         matrix, right = np.zeros((2 * count + 3, 2 * count + 3)), np.zeros(2 * count + 3)
-        values = np.where(known, error, 0.0)
         for k in range(count):
             own = slice(2 * k, 2 * k + 2)
             weighted = weights[k][:, None] * columns
@@ -316,37 +281,22 @@ def _moves(error: NDArray, angles: NDArray, radius: float) -> tuple[NDArray[np.f
             right[own] = weighted.T @ values[k]
         matrix[-3, -3], right[-3] = weights.sum() + 1e-9, (weights * values).sum()
         matrix[-2:, -2:] = (count * prior + 1e-9) * np.eye(2)
-        solution = np.linalg.solve(matrix, right)
+        solution = np.asarray(np.linalg.solve(matrix, right), np.float64)
         shift, grow = solution[: 2 * count].reshape(-1, 2), float(solution[-3])
     return shift, grow
 
 
-LEAST_RIM, LEAST_RIM_PX = 0.005, 1.0
-"""Smallest rim, in radii and px."""
-MOST_RIM = 0.06
-"""Largest rim, in radii."""
-TISSUE = (0.06, 0.12)
-"""Depths, in radii, that show tissue in all endoscopes."""
-RADIAL = 1.6
-"""In a rim the level changes this many times more across the border than deeper in the image."""
-FADED = 0.7
-"""A rim is darker than this share of the level that tissue's own fall-off leads to."""
-
-
-def _measure_rim(grays: Sequence[NDArray[np.uint8]], edges: Edges, darkness: Darkness) -> float:
-    """Width of the rim, px inside of the radius.
-
-    Tissue moves and its structures have any direction. A rim stays, is lit or faded, and changes across the border:
-    the rim ends at the last depth where levels change much more across the border than along it, or are faded.
+def _measure_rim(edges: Edges) -> float:
+    """Width of the rim, px inside of the radius: it ends at the last depth where levels are faded, or change much more
+    across the border than along it. Tissue moves and its structures have any direction; a rim stays.
     """
     depths = np.arange(0.0, TISSUE[1] * edges.radius, 0.5)
-    levels = _profiles(grays, edges.centers, edges.radius, edges.angles, depths) - darkness.level
-    rows = levels[edges.hits]
+    rows = (edges.profiles(depths) - edges.black)[edges.hits]
     rows = rows[np.isfinite(rows).all(1)]
     least = max(LEAST_RIM * edges.radius, LEAST_RIM_PX)
     tissue = depths >= TISSUE[0] * edges.radius
     normal = rows[:, tissue].mean(1)
-    lit = normal > 2 * darkness.step
+    lit = normal > 2 * edges.step
     if lit.sum() < 20:
         return least
     share = rows[lit] / normal[lit, None]

@@ -13,29 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape
+from .components import Image
 
 SMALL_STEP, LARGE_STEP = 16, 64
 """Penalty per block pixel for a disparity change of one px between neighbors, and for a larger change."""
-UNIQUENESS_PERCENT = 10
-"""Margin by which the best match must beat the second best."""
-CONTRAST_LIMIT = 31
-"""Image gradients are clipped to this before matching, levels."""
+UNIQUENESS_PERCENT = 10  # Margin by which the best match must beat the second best
+CONTRAST_LIMIT = 31  # Image gradients are clipped to this before matching, levels
+LOOK_WIDTH = 320  # The order of the images is found at this width, px
+NEAREST_SHARE = 0.2
+"""Largest disparity of that search, as a share of the width: about that of a point 20 mm away at a 4 mm baseline."""
+BLOCK_PX = 7  # Side of its matching blocks, px
+AGREE_PX = 1.0  # Tolerance of its left-right consistency check, px
+CLEARLY = 0.2  # The pair counts as swapped if the swapped order matches this much more of the image
+FEATURES = 1000  # Largest number of features per image
+RATIO = 0.75  # A feature's best match must be nearer than this times its second best (D. Lowe, IJCV 2004)
+FEWEST_MATCHES = 20  # With fewer matches the vertical offset is unknown
 
 
 def match_both_ways(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], lowest: int, highest: int, block: int
+    left: Image, right: Image, lowest: int, highest: int, block: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Disparity x_left - x_right at the pixels of either image.
-
-    A pixel whose match lies outside the other image still gets a value, extrapolated from its neighbors.
-
-    Args:
-        left, right: (H, W) gray.
-        lowest, highest: range of disparities, px; may be negative.
-        block: side of the matching blocks, px, odd.
-    Returns:
-        (H, W) disparity of the left image and (H, W) of the right image, px in steps of 1/16; NaN where no match is
-        unique.
+    """Disparity x_left - x_right, px in steps of 1/16, at the pixels of both gray images (H, W); NaN where no match is
+    unique. A match outside the other image is extrapolated from neighbors. Disparities may be negative; the matching
+    block has an odd side.
     """
     # After mirroring both images, the right image is matched like a left one.
     mirrored = _match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), lowest, highest, block)
@@ -43,9 +43,8 @@ def match_both_ways(
 
 
 def disagreement(from_left: NDArray[np.float32], from_right: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) left-right consistency: difference of the two disparities at matching pixels, px.
-
-    Infinite where either is unknown, and where the match lies outside the right image.
+    """(H, W) left-right consistency: difference of the two disparities at matching pixels, px; infinite where either is
+    unknown, and where the match lies outside the right image.
     """
     height, width = from_left.shape
     known = np.isfinite(from_left)
@@ -55,10 +54,10 @@ def disagreement(from_left: NDArray[np.float32], from_right: NDArray[np.float32]
     return np.where(known & np.isfinite(partner), np.abs(partner - from_left), np.inf).astype(np.float32)
 
 
-def _match(near: NDArray[np.uint8], other: NDArray[np.uint8], lowest: int, highest: int, block: int) -> NDArray:
+def _match(near: Image, other: Image, lowest: int, highest: int, block: int) -> NDArray:
     """(H, W) disparity of `near`'s pixels, px; NaN where no match is unique."""
     count = -(-(highest - lowest + 1) // 16) * 16
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=lowest,
         numDisparities=count,
         blockSize=block,
@@ -73,26 +72,7 @@ def _match(near: NDArray[np.uint8], other: NDArray[np.uint8], lowest: int, highe
     before, after = max(lowest + count, 0), max(-lowest, 0)
     wide = [cv2.copyMakeBorder(camera, 0, 0, before, after, cv2.BORDER_REPLICATE) for camera in (near, other)]
     sixteenths = matcher.compute(*wide)[:, before : before + near.shape[1]]
-    found = sixteenths >= 16 * lowest
-    return np.where(found, sixteenths * np.float32(1 / 16), np.float32(np.nan))
-
-
-LOOK_WIDTH = 320
-"""Images are matched at this width, px."""
-NEAREST_SHARE = 0.2
-"""Largest disparity of the search, as a share of the width: about that of a point 20 mm away at a 4 mm baseline."""
-BLOCK_PX = 7
-"""Side of the matching blocks, px."""
-AGREE_PX = 1.0
-"""Tolerance of the left-right consistency check, px."""
-CLEARLY = 0.2
-"""The pair counts as swapped if the swapped order matches this much more of the image."""
-FEATURES = 1000
-"""Largest number of features per image."""
-RATIO = 0.75
-"""A feature's best match must be nearer than this times its second best (D. Lowe, IJCV 2004)."""
-FEWEST_MATCHES = 20
-"""With fewer matches the vertical offset is unknown."""
+    return np.where(sixteenths >= 16 * lowest, sixteenths * np.float32(1 / 16), np.float32(np.nan))
 
 
 @dataclass(frozen=True)
@@ -108,45 +88,33 @@ class StereoOrder:
         return self.exchanged > self.as_given + CLEARLY
 
 
-def stereo_order(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> StereoOrder:
-    """Match a rectified pair as given and swapped. In the correct order all disparities are positive.
-
-    Args:
-        left_u8, right_u8: (H, W, 3) rectified images, 0..255.
-    Returns:
-        the share of pixels that pass the left-right consistency check, in either order.
-    Raises:
-        ValueError: wrong shapes.
-    """
+def stereo_order(left_u8: Image, right_u8: Image) -> StereoOrder:
+    """Match a rectified pair, (H, W, 3) each, as given and swapped: in the right order all disparities are positive."""
     left, right = _gray(left_u8, right_u8)
     height, width = left.shape
     scale = min(1.0, LOOK_WIDTH / width)
     size = max(round(width * scale), 1), max(round(height * scale), 1)
-    left, right = (cv2.resize(camera, size, interpolation=cv2.INTER_AREA) for camera in (left, right))
-    return StereoOrder(_explained(left, right), _explained(right, left))
+    left, right = (np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), np.uint8) for x in (left, right))
+    # Exclude 0, the disparity of infinity, which black margins and burned-in text have in either order.
+    highest = 1 + max(int(NEAREST_SHARE * size[0]), 16)
+    agree = (
+        disagreement(*match_both_ways(*pair, 1, highest, BLOCK_PX)) <= AGREE_PX
+        for pair in ((left, right), (right, left))
+    )
+    return StereoOrder(*(float(each.mean()) for each in agree))
 
 
-def vertical_offset_px(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> float:
-    """Vertical offset of a stereo pair: the median |y_left - y_right| of matching features.
-
-    A rectified pair has less than about half a pixel.
-
-    Args:
-        left_u8, right_u8: (H, W, 3) images, 0..255.
-    Returns:
-        px; NaN if too few features match.
-    Raises:
-        ValueError: wrong shapes.
-    """
+def vertical_offset_px(left_u8: Image, right_u8: Image) -> float:
+    """Median |y_left - y_right| of matching features of a pair (H, W, 3), px, or NaN; below 0.5 if it is rectified."""
     offsets = np.abs(row_offsets_px(left_u8, right_u8))
     return float(np.median(offsets)) if len(offsets) >= FEWEST_MATCHES else float("nan")
 
 
-def row_offsets_px(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> NDArray[np.float64]:
+def row_offsets_px(left_u8: Image, right_u8: Image) -> NDArray[np.float64]:
     """(N,) y_right - y_left of each matching feature, px; arguments as for `vertical_offset_px`."""
-    finder = cv2.SIFT_create(FEATURES)
+    finder, whole = cv2.SIFT.create(FEATURES), np.empty(0, np.uint8)
     (left, left_marks), (right, right_marks) = (
-        finder.detectAndCompute(camera, None) for camera in _gray(left_u8, right_u8)
+        finder.detectAndCompute(camera, whole) for camera in _gray(left_u8, right_u8)
     )
     if min(len(left), len(right)) < FEWEST_MATCHES:
         return np.zeros(0)
@@ -155,15 +123,6 @@ def row_offsets_px(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> N
     return np.array([right[m.trainIdx].pt[1] - left[m.queryIdx].pt[1] for m in good])
 
 
-def _gray(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Both images in gray, checked."""
+def _gray(left_u8: Image, right_u8: Image) -> list[Image]:
     check_shape("left_u8:H,W,3 right_u8:H,W,3", left_u8=left_u8, right_u8=right_u8)
-    return cv2.cvtColor(left_u8, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right_u8, cv2.COLOR_RGB2GRAY)
-
-
-def _explained(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
-    """Share of the left image's pixels that pass the left-right consistency check with positive disparity."""
-    # Exclude 0, the disparity of infinity, which black margins and burned-in text have in either order.
-    highest = 1 + max(int(NEAREST_SHARE * left.shape[1]), 16)
-    apart = disagreement(*match_both_ways(left, right, 1, highest, BLOCK_PX))
-    return float((apart <= AGREE_PX).mean())
+    return [np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), np.uint8) for each in (left_u8, right_u8)]

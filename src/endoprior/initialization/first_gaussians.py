@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,12 @@ from .flow_tracks import InitialMotion, initial_motion
 from .sampling import PointCloud, concatenated, has_surface, initial_log_scales, initial_points
 from .unseen import unseen_points
 
-WINDOW_SHARE = 1 / 60
-"""Width of the window in which a plane is fitted, as a share of the image's."""
-SAME_SURFACE = 0.03
-"""Pixels whose depth differs by more than this share belong to other tissue."""
+WINDOW_SHARE = 1 / 60  # width of the window in which a plane is fitted, as a share of the image's
+SAME_SURFACE = 0.03  # pixels whose depth differs by more than this share belong to other tissue
 PLAIN = 1e-4
 """Pull towards a plane at right angles to the ray, where a window holds too few pixels: share of the fit's weight."""
-BYTES_PER_POINT = 100
-"""Memory for each pixel of each window, bytes."""
+UNSEEN_OPACITY = 0.9  # initial opacity of what no frame shows: no color asks for it
+BYTES_PER_POINT = 100  # memory for each pixel of each window, bytes
 
 
 def surface_normals(cloud: PointCloud, frames: Sequence[Frame]) -> NDArray[np.float32]:
@@ -94,34 +92,25 @@ def _normals_of_frame(points: NDArray, frame: Frame) -> NDArray:
     return n @ camera.world_to_camera[:3, :3]
 
 
-UNSEEN_OPACITY = 0.9
-"""Initial opacity of what no frame shows: no color asks for it."""
-
-
 @dataclass(frozen=True)
 class FirstGaussians:
     """The start of N Gaussians."""
 
-    cloud: PointCloud
-    """Centers, colors and source frames."""
-    log_scales: NDArray[np.float32]
-    """(N, 3) log of mm."""
-    quats: NDArray[np.float32]
-    """(N, 4) wxyz."""
-    opacities: NDArray[np.float32]
-    """(N,) in (0, 1)."""
-    motion: InitialMotion | None
-    """None: at rest."""
+    cloud: PointCloud  # centers, colors and source frames
+    log_scales: NDArray[np.float32]  # (N, 3) log of mm
+    quats: NDArray[np.float32]  # (N, 4) wxyz
+    opacities: NDArray[np.float32]  # (N,) in (0, 1)
+    motion: InitialMotion | None  # None: at rest
 
 
-def resting_spheres(cloud: PointCloud, opacity: float) -> FirstGaussians:
+def resting_spheres(cloud: PointCloud, opacity: float, variance_factor: float = 1.0) -> FirstGaussians:
     """Spheres at rest, as wide as their neighbors are apart: how 3DGS and what follows it starts.
 
     Args:
-        opacity: in (0, 1).
+        opacity: in (0, 1). variance_factor: multiplies the squared width.
     """
     num = len(cloud)
-    log_scales = np.tile(initial_log_scales(cloud.points)[:, None], 3)
+    log_scales = np.tile(initial_log_scales(cloud.points, variance_factor)[:, None], 3)
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1))
     return FirstGaussians(cloud, log_scales, quats, np.full(num, opacity, np.float32), None)
 
@@ -137,16 +126,16 @@ def first_gaussians(frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
     init, basis = cfg.init, cfg.deformation.basis
     cloud = initial_points(frames, init, cfg.released, cfg.seed)
     cloud = cloud.subset(morton_order(cloud.points))
+    num_seen = len(cloud)
     motion = initial_motion(frames, cloud, basis) if init.motion == "flow" else None
-    opacities = np.full(len(cloud), init.opacity, np.float32)
     if init.fill_unseen:
-        unseen, coefficients = unseen_points(frames, cloud, motion and motion.coefficients, basis)
+        coefficients = motion.coefficients if motion else np.zeros((num_seen, 0, 3), np.float32)
+        unseen, coefficients = unseen_points(frames, cloud, coefficients, basis)
         cloud = concatenated([cloud, unseen])
         motion = motion and motion.joined(coefficients)
-        opacities = np.concatenate([opacities, np.full(len(unseen), UNSEEN_OPACITY, np.float32)])
-    log_scales = np.tile(initial_log_scales(cloud.points, init.variance_factor)[:, None], 3)
-    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(cloud), 1))
+    first = replace(resting_spheres(cloud, init.opacity, init.variance_factor), motion=motion)
+    first.opacities[num_seen:] = UNSEEN_OPACITY
     if init.thickness < 1:
-        quats = flat_along(surface_normals(cloud, frames))
-        log_scales[:, 2] += np.float32(np.log(init.thickness))
-    return FirstGaussians(cloud, log_scales, quats, opacities, motion)
+        first.quats[:] = flat_along(surface_normals(cloud, frames))
+        first.log_scales[:, 2] += np.float32(np.log(init.thickness))
+    return first

@@ -19,6 +19,7 @@ import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -34,70 +35,15 @@ from ..system.memory import workers
 from .neighbor_motion import fill_gaps, smooth_motion
 from .sampling import PointCloud, has_surface
 
-SPACING = 12
-"""Largest number of frames between two anchors. With 6 the tracks of the phantoms are no better."""
-LEAST_ANCHORS = 4
-"""Also of a short sequence: a point that is hidden in one anchor is followed by way of another."""
-REACH = 48
-"""Frames to both sides of an anchor to which flow is computed."""
-Flow = NDArray[np.float16]
-"""(h, w, 2) px of the gray images. Half precision: 0.01 px at 30 px, and all flows of an anchor fit in memory."""
-
-
-@dataclass(frozen=True)
-class AnchorFlow:
-    """The flows between one anchor and the frames around it."""
-
-    anchor: int
-    there: dict[int, Flow]
-    """By frame: flow from the anchor to it."""
-    back: dict[int, Flow]
-    """By frame: flow from it to the anchor."""
-
-
-def anchors(count: int) -> list[int]:
-    """Positions of the anchors among `count` frames: the middles of equal parts of at most `SPACING` frames."""
-    parts = max(-(-count // SPACING), min(count, LEAST_ANCHORS))
-    return [int((i + 0.5) * count / parts) for i in range(parts)]
-
-
-def neighbor_flows(grays: Sequence[NDArray[np.uint8]], k: int) -> tuple[Flow, Flow]:
-    """Flow from image `k` to the next one, and back."""
-    first, second = grays[k], grays[k + 1]
-    return fine_flow(first, second).astype(np.float16), fine_flow(second, first).astype(np.float16)
-
-
-def anchor_flow(grays: Sequence[NDArray[np.uint8]], neighbors: Sequence[tuple[Flow, Flow]], anchor: int) -> AnchorFlow:
-    """The flows between image `anchor` and those up to `REACH` from it.
-
-    Args:
-        grays: T gray images. neighbors: T - 1 results of `neighbor_flows`.
-    """
-    still = np.zeros((*grays[0].shape, 2), np.float16)
-    there, back = {anchor: still}, {anchor: still}
-    for last, step in ((min(anchor + REACH, len(grays) - 1), 1), (max(anchor - REACH, 0), -1)):
-        for k in range(anchor, last, step):
-            onward, returning = neighbors[k] if step > 0 else neighbors[k - 1][::-1]
-            guess_there, guess_back = _composed(there[k], onward), _composed(returning, back[k])
-            there[k + step] = fine_flow(grays[anchor], grays[k + step], guess_there).astype(np.float16)
-            back[k + step] = fine_flow(grays[k + step], grays[anchor], guess_back).astype(np.float16)
-    return AnchorFlow(anchor, there, back)
-
-
-def _composed(first: Flow, second: Flow) -> NDArray[np.float32]:
-    """(h, w, 2) flow that goes along `first` and from there along `second`."""
-    first, second = first.astype(np.float32), second.astype(np.float32)
-    row, column = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
-    x, y = column + first[..., 0], row + first[..., 1]
-    return first + cv2.remap(second, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
+SPACING = 12  # largest number of frames between two anchors. With 6 the tracks of the phantoms are no better.
+LEAST_ANCHORS = 4  # also of a short sequence: a point that is hidden in one anchor is followed by way of another
+REACH = 48  # frames to both sides of an anchor to which flow is computed
 CYCLE_PX = 0.25
 """A point is lost where forward and backward flow of its two steps disagree by more than this, px of the flow."""
-ANCHOR_BYTES = 8 * (2 * REACH + 1)
-"""Memory per pixel of the flows of one anchor, bytes."""
-RIDGE = 1e-5
-"""Ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1."""
+ANCHOR_BYTES = 8 * (2 * REACH + 1)  # memory per pixel of the flows of one anchor, bytes
+RIDGE = 1e-5  # ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1
+Flow = NDArray[np.float16]
+"""(h, w, 2) px of the gray images. Half precision: 0.01 px at 30 px, and all flows of an anchor fit in memory."""
 
 log = logging.getLogger(__name__)
 
@@ -106,8 +52,7 @@ log = logging.getLogger(__name__)
 class InitialMotion:
     """How N points move, and in which of T training frames the flow says so."""
 
-    coefficients: NDArray[np.float32]
-    """(N, B, 3) temporal coefficients of the centers, mm."""
+    coefficients: NDArray[np.float32]  # (N, B, 3) temporal coefficients of the centers, mm
     followed: NDArray[np.bool_]
     """(N, T) True where the flow found the point and returned to it; elsewhere its neighbors carried it."""
 
@@ -118,13 +63,11 @@ class InitialMotion:
 
 
 def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> InitialMotion:
-    """Temporal coefficients that move every point of the cloud along its track.
+    """Temporal coefficients that move every point of the cloud along its track; 0 in frames too small for optical flow.
 
     Args:
         frames: T training frames (never test frames), in order.
         cloud: points with their source frames.
-    Returns:
-        The motion; none at all for frames too small for optical flow.
     """
     height, width = frames[0].tissue_mask.shape
     if min(height, width) < MIN_SIZE_PX:
@@ -164,6 +107,50 @@ def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.i
     return pixels
 
 
+def anchors(count: int) -> list[int]:
+    """Positions of the anchors among `count` frames: the middles of equal parts of at most `SPACING` frames."""
+    parts = max(-(-count // SPACING), min(count, LEAST_ANCHORS))
+    return [int((i + 0.5) * count / parts) for i in range(parts)]
+
+
+def neighbor_flows(grays: Sequence[NDArray[np.uint8]], k: int) -> tuple[Flow, Flow]:
+    """Flow from image `k` to the next one, and back."""
+    first, second = grays[k], grays[k + 1]
+    return fine_flow(first, second).astype(np.float16), fine_flow(second, first).astype(np.float16)
+
+
+class AnchorFlow(NamedTuple):
+    """The flows between one anchor and the frames around it, by frame."""
+
+    anchor: int
+    there: dict[int, Flow]
+    back: dict[int, Flow]
+
+
+def anchor_flow(grays: Sequence[NDArray[np.uint8]], neighbors: Sequence[tuple[Flow, Flow]], anchor: int) -> AnchorFlow:
+    """The flows between image `anchor` and those up to `REACH` from it.
+
+    Args:
+        grays: T gray images. neighbors: T - 1 results of `neighbor_flows`.
+    """
+    still = np.zeros((*grays[0].shape, 2), np.float16)
+    there, back = {anchor: still}, {anchor: still}
+    for last, step in ((min(anchor + REACH, len(grays) - 1), 1), (max(anchor - REACH, 0), -1)):
+        for k in range(anchor, last, step):
+            onward, returning = neighbors[k] if step > 0 else neighbors[k - 1][::-1]
+            guess_there, guess_back = _composed(there[k], onward), _composed(returning, back[k])
+            there[k + step] = fine_flow(grays[anchor], grays[k + step], guess_there).astype(np.float16)
+            back[k + step] = fine_flow(grays[k + step], grays[anchor], guess_back).astype(np.float16)
+    return AnchorFlow(anchor, there, back)
+
+
+def _composed(first: Flow, second: Flow) -> NDArray[np.float32]:
+    """(h, w, 2) flow that goes along `first` and from there along `second`."""
+    start, row_column = first.astype(np.float32), np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
+    x, y = row_column[1] + start[..., 0], row_column[0] + start[..., 1]
+    return start + cv2.remap(second.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
 def _add_tracks(
     flow: AnchorFlow,
     masks: Sequence[NDArray[np.bool_]],
@@ -178,25 +165,21 @@ def _add_tracks(
     Args:
         masks: (H, W) tissue of each frame. sources: (N, 2) px in the frames `origins` (N,).
     """
+
+    def followed(points: NDArray, there: Flow, back: Flow, frame: int) -> tuple[NDArray, NDArray]:
+        return follow(points, there.astype(np.float32), back.astype(np.float32), masks[frame])
+
+    there, back = flow.there, flow.back
     at_anchor, first_step = np.full_like(sources, np.nan), np.full(len(sources), np.inf)
-    for t in flow.there:
+    for t in there:
         own = np.flatnonzero(origins == t)
-        at_anchor[own], first_step[own] = _followed(sources[own], flow.back[t], flow.there[t], masks[flow.anchor])
+        at_anchor[own], first_step[own] = followed(sources[own], back[t], there[t], flow.anchor)
     near = np.flatnonzero(first_step <= limit_px)
-    for t in flow.there:
-        end, second_step = _followed(at_anchor[near], flow.there[t], flow.back[t], masks[t])
+    for t in there:
+        end, second_step = followed(at_anchor[near], there[t], back[t], t)
         both = first_step[near] + second_step
         better = (both < error[t, near]) & (both <= limit_px)
         error[t, near[better]], pixels[t, near[better]] = both[better], end[better]
-
-
-def _followed(
-    pixels: NDArray[np.float64], there: NDArray[np.float16], back: NDArray[np.float16], mask: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels (N, 2) after one step, and by how much the step back misses (N,), px; infinite off the tissue `mask`."""
-    end, cycle_px = np.empty_like(pixels), np.empty(len(pixels))
-    follow(pixels, there.astype(np.float32), back.astype(np.float32), mask, end, cycle_px)
-    return end, cycle_px
 
 
 def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float32]:
@@ -216,29 +199,27 @@ def fit_basis(offsets: NDArray[np.floating], times: list[float], cfg: BasisConfi
     """Least-squares coefficients (N, B, 3) of offsets (T, N, 3) mm at T `times` in [0, 1]."""
     weights = np.stack([basis_weights(time, cfg) for time in times])
     normal = weights.T @ weights + RIDGE * np.eye(cfg.num_bases)
-    solve = np.linalg.solve(normal, weights.T)
-    fitted = solve @ offsets.reshape(len(times), -1)
+    fitted = np.linalg.solve(normal, weights.T) @ offsets.reshape(len(times), -1)
     return np.ascontiguousarray(fitted.reshape(cfg.num_bases, -1, 3).transpose(1, 0, 2), np.float32)
 
 
 @njit(parallel=True, cache=True)
-def follow(pixels, there, back, tissue_mask, out, cycle_px):
-    """Move pixels (N, 2) along the flow `there` (h, w, 2), and measure by how much `back` misses their start.
-
-    `cycle_px` is infinite where the point leaves the image or the tissue (H, W). Flow is in px of its own size, all
-    else in px of the mask.
-    """
+def follow(pixels, there, back, tissue_mask):
+    # Where pixels (N, 2) get to along the flow `there` (h, w, 2), and by how much `back` misses their start, (N,) px:
+    # infinite where the point leaves the image or the tissue (H, W). Flow is in px of its own size, all else in px of
+    # the mask.
     height, width = tissue_mask.shape
     scale_x, scale_y = width / there.shape[1], height / there.shape[0]
+    end, cycle_px = np.empty_like(pixels), np.full(len(pixels), np.inf)
     for n in prange(len(pixels)):
         x, y = pixels[n]
         step_x, step_y = _flow(there, x / scale_x, y / scale_y)
         x, y = x + step_x * scale_x, y + step_y * scale_y
-        out[n, 0], out[n, 1] = x, y
-        cycle_px[n] = np.inf
-        if 0 <= x <= width and 0 <= y <= height and tissue_mask[_cell(y, height), _cell(x, width)]:
+        end[n, 0], end[n, 1] = x, y
+        if 0 <= x <= width and 0 <= y <= height and tissue_mask[min(int(y), height - 1), min(int(x), width - 1)]:
             back_x, back_y = _flow(back, x / scale_x, y / scale_y)
             cycle_px[n] = np.hypot((step_x + back_x) * scale_x, (step_y + back_y) * scale_y)
+    return end, cycle_px
 
 
 @njit(inline="always")
@@ -247,18 +228,14 @@ def _flow(flow, x, y):
     height, width = flow.shape[:2]
     u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
     column, row = int(u), int(v)
+    right, below = min(column + 1, width - 1), min(row + 1, height - 1)
     fx, fy = u - column, v - row
     x = y = 0.0
     for i, j, weight in (
         (row, column, (1 - fx) * (1 - fy)),
-        (row, min(column + 1, width - 1), fx * (1 - fy)),
-        (min(row + 1, height - 1), column, (1 - fx) * fy),
-        (min(row + 1, height - 1), min(column + 1, width - 1), fx * fy),
+        (row, right, fx * (1 - fy)),
+        (below, column, (1 - fx) * fy),
+        (below, right, fx * fy),
     ):
         x, y = x + weight * flow[i, j, 0], y + weight * flow[i, j, 1]
     return x, y
-
-
-@njit(inline="always")
-def _cell(position, size):
-    return min(int(position), size - 1)

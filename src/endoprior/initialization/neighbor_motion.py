@@ -10,26 +10,20 @@ from collections import defaultdict
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
-LEAST_SHARE = 0.34
-"""Neighbors carry a point as long as those that are known have this share of the weight."""
-CARRIERS = 12
-"""Known points that carry a lost one."""
+LEAST_SHARE = 0.34  # neighbors carry a point as long as those that are known have this share of the weight
+CARRIERS = 12  # known points that carry a lost one
 COMPANIONS, COMPANION_STEP = 128, 4
 """A point moves as the mean of its 128 nearest points; every fourth of them is asked, the nearest first."""
 
 
 def fill_gaps(positions: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Tracks without gaps.
+    """Tracks (T, N, 3) without the gaps, NaN, of `positions` (T, N, 3).
 
     A lost point keeps its place among its neighbors: those nearest to it in the last frame in which it was known, and
-    in the next one. Both predictions are weighted by how recent they are.
-
-    Args:
-        positions: (T, N, 3), NaN where a point is lost.
-    Returns:
-        (T, N, 3); a point that is never known, or whose neighbors all are lost, stays where it was last, or is NaN.
+    in the next one. Both predictions are weighted by how recent they are. A point whose neighbors are all lost stays
+    where it was last; one that is never known stays NaN.
     """
     known = np.isfinite(positions[..., 0])
     filled, since = _swept(positions, known, 1)
@@ -39,7 +33,11 @@ def fill_gaps(positions: NDArray[np.floating]) -> NDArray[np.floating]:
         share = (until[t, both] / (since[t, both] + until[t, both])).astype(positions.dtype)[:, None]
         filled[t, both] = share * filled[t, both] + (1 - share) * backward[t, both]
         filled[t, ahead] = backward[t, ahead]
-    return _held(filled)
+    for step in (1, -1):  # what is lost still stays where it was before, else where it is next
+        for t in range(len(filled))[::step][:-1]:
+            gap = np.isnan(filled[t + step])
+            filled[t + step][gap] = filled[t][gap]
+    return filled
 
 
 def _swept(
@@ -54,40 +52,25 @@ def _swept(
         carriers = np.flatnonzero(known[t] & known[t + step])
         if not len(lost) or len(carriers) < CARRIERS:
             continue
-        distances, nearest = cKDTree(carried[t, carriers]).query(carried[t, lost], k=CARRIERS)
+        distances, nearest = KDTree(carried[t, carriers]).query(carried[t, lost], k=CARRIERS)
         ends = carry(carried, known, t, step, lost, carriers[nearest], weights_by_distance(distances), age)
         for end in np.unique(ends[ends >= 0]):
             waiting[int(end)].append(lost[ends == end])
     return carried, age
 
 
-def _held(positions: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Positions (T, N, 3) with NaN replaced by the point's nearest frame before, else after."""
-    for step in (1, -1):
-        order = range(len(positions))[::step]
-        for t in order[:-1]:
-            gap = np.isnan(positions[t + step])
-            positions[t + step][gap] = positions[t][gap]
-    return positions
-
-
 def smooth_motion(positions: NDArray[np.floating], origins: NDArray[np.integer]) -> NDArray[np.float32]:
-    """Displacement of each point from its source frame: the mean of that of the points around it.
+    """(T, N, 3) displacement of each point from its source frame (N,), mm: the mean of that of the points around it.
 
     Measured depth errs by ten times as much as the flow does, and differently for each pixel. Points a fraction of a
     millimeter apart move alike.
-
-    Args:
-        positions: (T, N, 3) finite. origins: (N,) source frame of each point.
-    Returns:
-        (T, N, 3) mm.
     """
     offsets = np.empty(positions.shape, np.float32)
     count = min(COMPANIONS, positions.shape[1])
     for source in np.unique(origins):
         own = np.flatnonzero(origins == source)
-        tree = cKDTree(positions[source])
-        distances, nearest = tree.query(positions[source, own], k=np.arange(1, count + 1, COMPANION_STEP), workers=-1)
+        tree, asked = KDTree(positions[source]), np.arange(1, count + 1, COMPANION_STEP)
+        distances, nearest = tree.query(positions[source, own], k=asked, workers=-1)  # pyright: ignore[reportArgumentType]
         mean_displacement(positions, source, own, nearest, weights_by_distance(distances), offsets)
     return offsets
 
@@ -100,38 +83,27 @@ def weights_by_distance(distances: NDArray[np.floating]) -> NDArray[np.floating]
 
 @njit(parallel=True, cache=True)
 def carry(positions, known, start, step, points, neighbors, weights, age):
-    """Carry points that are lost after frame `start` by the mean displacement of neighbors since then.
-
-    Args:
-        positions: (T, N, 3), NaN where nothing is known; written in the frames in which a point is carried.
-        known: (T, N) True where a position was measured.
-        step: +1 or -1: the direction in time.
-        points: (P,) points whose position at `start` is set. neighbors: (P, k) points known at `start`.
-        weights: (P, k), of sum 1.
-        age: (T, N) frames since the position was measured; written beside `positions`.
-    Returns:
-        (P,) frame from which the neighbors no longer suffice, and the point needs others; -1 if they do.
-    """
-    num_frames = len(positions)
+    # Carry `points` (P,), lost after frame `start`, by the mean displacement of their `neighbors` (P, k) since then.
+    # positions (T, N, 3) are written, and age (T, N), the frames since a position was measured, where `known` (T, N)
+    # says that it was not. `step`, +1 or -1, is the direction in time. Returns (P,) the frame from which the neighbors
+    # no longer suffice, and the point needs others; -1 if they do.
     ends = np.full(len(points), -1)
     for p in prange(len(points)):
-        n = points[p]
-        t = start + step
-        while 0 <= t < num_frames and not known[t, n]:
-            total = x = y = z = 0.0
+        n, t, moved = points[p], start + step, np.zeros(3)
+        while 0 <= t < len(positions) and not known[t, n]:
+            total = 0.0
+            moved[:] = 0.0
             for k in range(neighbors.shape[1]):
                 j = neighbors[p, k]
                 if known[t, j]:
                     total += weights[p, k]
-                    x += weights[p, k] * (positions[t, j, 0] - positions[start, j, 0])
-                    y += weights[p, k] * (positions[t, j, 1] - positions[start, j, 1])
-                    z += weights[p, k] * (positions[t, j, 2] - positions[start, j, 2])
+                    for c in range(3):
+                        moved[c] += weights[p, k] * (positions[t, j, c] - positions[start, j, c])
             if total < LEAST_SHARE:
                 ends[p] = t - step
                 break
-            positions[t, n, 0] = positions[start, n, 0] + x / total
-            positions[t, n, 1] = positions[start, n, 1] + y / total
-            positions[t, n, 2] = positions[start, n, 2] + z / total
+            for c in range(3):
+                positions[t, n, c] = positions[start, n, c] + moved[c] / total
             age[t, n] = age[t - step, n] + 1
             t += step
     return ends
@@ -139,13 +111,14 @@ def carry(positions, known, start, step, points, neighbors, weights, age):
 
 @njit(parallel=True, cache=True)
 def mean_displacement(positions, source, points, neighbors, weights, offsets):
-    """Set offsets (T, N, 3) of `points` (P,) to the mean displacement of `neighbors` (P, k) since frame `source`."""
+    # Set offsets (T, N, 3) of `points` (P,) to the mean displacement of `neighbors` (P, k) since frame `source`.
     for p in prange(len(points)):
+        moved = np.zeros(3)
         for t in range(len(positions)):
-            x = y = z = 0.0
+            moved[:] = 0.0
             for k in range(neighbors.shape[1]):
                 j = neighbors[p, k]
-                x += weights[p, k] * (positions[t, j, 0] - positions[source, j, 0])
-                y += weights[p, k] * (positions[t, j, 1] - positions[source, j, 1])
-                z += weights[p, k] * (positions[t, j, 2] - positions[source, j, 2])
-            offsets[t, points[p], 0], offsets[t, points[p], 1], offsets[t, points[p], 2] = x, y, z
+                for c in range(3):
+                    moved[c] += weights[p, k] * (positions[t, j, c] - positions[source, j, c])
+            for c in range(3):
+                offsets[t, points[p], c] = moved[c]

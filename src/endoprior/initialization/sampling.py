@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..core.checks import check_shape, input_error
 from ..core.config import InitConfig, ReleasedMethod
@@ -24,17 +24,28 @@ from ..priors.specular import VALUE_THRESHOLD
 from ..render.constants import NEAR_Z
 from ..system.memory import workers
 
+UNIFORM_FRACTION = 0.45  # eta_app: share of the probability spread evenly over the eroded tissue mask
+EROSION_PX = 9  # k: side of the elliptical element that erodes the tissue mask
+POOL_FRACTION = 0.01  # share of tissue pixels that each frame gives to EndoGaussian's pool
+VOXEL_DIVISIONS, OUTLIER_NEIGHBORS, OUTLIER_STD = 400, 20, 1.5
+"""Clean-up of the released code: voxels along the longest side of the box; points are dropped whose mean distance to so
+many neighbors is above the mean by more than so many standard deviations."""
+EPSILON = 1e-6  # keeps Eq. (6) finite where the mask or the prior is empty
+MIN_SQUARED_SPACING = 1e-7  # mm^2; initial scale of points that coincide, as EndoGaussian sets it
+ADAPTIVE_PERCENTILE = 97.0  # percentile of brightness that raises tau_v (released code)
+PRIOR_BYTES = 200  # memory per pixel while sampling the points of a frame, bytes
+MIN_POINTS = 4  # the initial scale needs three neighbors
+
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class PointCloud:
     """Colored points."""
 
-    points: NDArray[np.float32]
-    """(N, 3) world coordinates, mm."""
-    colors: NDArray[np.float32]
-    """(N, 3) red, green, blue in [0, 1]."""
-    origins: NDArray[np.int32]
-    """(N,) position of the source frame of each point in the list of sampled frames."""
+    points: NDArray[np.float32]  # (N, 3) world coordinates, mm
+    colors: NDArray[np.float32]  # (N, 3) red, green, blue in [0, 1]
+    origins: NDArray[np.int32]  # (N,) position of the source frame of each point in the list of sampled frames
 
     def __len__(self) -> int:
         return len(self.points)
@@ -52,13 +63,13 @@ def concatenated(clouds: list[PointCloud]) -> PointCloud:
 
 
 def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
-    """Replace the points of each voxel by their mean position and mean color.
+    """Replace the points of each voxel by their mean position and mean color, with the origin of the first one.
 
     Args:
         cloud: finite points.
         divisions: number of voxels along the longest side of the bounding box, whose corner is the center of a voxel.
     Returns:
-        One point per occupied voxel, ordered by voxel (x, then y, then z), with the origin of its first point.
+        One point per occupied voxel, ordered by voxel (x, then y, then z).
     """
     if len(cloud) == 0:
         return cloud
@@ -80,71 +91,48 @@ def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
 
 
 def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> PointCloud:
-    """Remove points whose mean distance to their neighbors is unusually large.
+    """Remove points whose mean distance to their nearest points is unusually large; all stay if there are too few.
 
     Args:
-        cloud: finite points.
         num_neighbors: number of nearest points in the mean, including the point itself (distance 0).
         num_std: points above the mean plus this many standard deviations are removed.
-    Returns:
-        The other points, in order; the cloud itself if it has at most `num_neighbors` points.
     """
     if len(cloud) <= num_neighbors:
         return cloud
-    distance, _ = cKDTree(cloud.points).query(cloud.points, k=num_neighbors)
+    distance, _ = KDTree(cloud.points).query(cloud.points, k=num_neighbors)
     average = distance.reshape(len(cloud), -1).mean(1)
     keep = average <= average.mean() + num_std * average.std(ddof=1)
     return cloud.subset(keep)
 
 
-UNIFORM_FRACTION = 0.45
-"""eta_app: share of the probability spread evenly over the eroded tissue mask."""
-EROSION_PX = 9
-"""k: side of the elliptical element that erodes the tissue mask."""
-POOL_FRACTION = 0.01
-"""Share of tissue pixels that each frame gives to EndoGaussian's pool."""
-VOXEL_DIVISIONS, OUTLIER_NEIGHBORS, OUTLIER_STD = 400, 20, 1.5
-"""Clean-up of the released code: voxels along the longest side of the box; points are dropped whose mean distance to so
-many neighbors is above the mean by more than so many standard deviations."""
-EPSILON = 1e-6
-"""Keeps Eq. (6) finite where the mask or the prior is empty."""
-MIN_SQUARED_SPACING = 1e-7
-"""mm^2; initial scale of points that coincide, as EndoGaussian sets it."""
-ADAPTIVE_PERCENTILE = 97.0
-"""Percentile of brightness that raises tau_v (released code)."""
-PRIOR_BYTES = 200
-"""Memory per pixel while sampling the points of a frame, bytes."""
-MIN_POINTS = 4
-"""The initial scale needs three neighbors."""
-
-log = logging.getLogger(__name__)
-
-
 def initial_points(
     frames: Sequence[Frame], cfg: InitConfig | None = None, released: ReleasedMethod | None = None, seed: int = 0
 ) -> PointCloud:
-    """Sample about `cfg.budget` surface points from the training frames.
+    """Sample at most `cfg.budget` surface points from the training frames, never from test frames.
 
     `prior` and `uniform` sample the same number of points from every frame, without replacement. `pool` is the sampler
     of EndoGaussian: it pools a share of the tissue of every frame and samples the budget with replacement, so points
     repeat. Only pixels with measured depth are used. If a frame has too few, all are used and a warning is logged.
 
-    Args:
-        frames: F training frames (never test frames), each used once.
-        cfg: sampler and budget.
-        released: what the released code does otherwise.
-        seed: equal seeds give equal points.
-    Returns:
-        At most B points in world axes; fewer after clean-up.
     Raises:
         InputError: fewer than 4 points are left.
     """
     cfg, released = cfg or InitConfig(), released or ReleasedMethod()
-    shares = [None] * len(frames) if cfg.sampler == "pool" else quotas(cfg.budget, len(frames))
+    shares = quotas(cfg.budget, len(frames))
 
     def sample(position: int) -> tuple[PointCloud, int]:
-        rng = np.random.default_rng([seed, position])
-        return _sample_points(frames[position], position, shares[position], cfg, released, rng)
+        """Points of one frame, and the number of missing points."""
+        frame, count = frames[position], shares[position]
+        probability = pixel_probability(frame, cfg, released.prior)
+        available = int(np.count_nonzero(probability))
+        if cfg.sampler == "pool":
+            count = min(available, max(1, int(POOL_FRACTION * available)))
+        flat = sample_pixels(probability, count, np.random.default_rng([seed, position]))
+        v, u = np.divmod(flat, frame.camera.width)
+        pixels = np.stack([u, v], -1) + (0.0 if released.half_pixel_shift else 0.5)
+        points = back_project(pixels, frame.depth[v, u].astype(np.float64), frame.camera).astype(np.float32)
+        colors = frame.rgb_u8[v, u].astype(np.float32) / np.float32(255)
+        return PointCloud(points, colors, np.full(len(points), position, np.int32)), max(0, count - available)
 
     threads = workers(PRIOR_BYTES * frames[0].tissue_mask.size) if len(frames) else 1
     with ThreadPoolExecutor(threads) as pool:  # NumPy and OpenCV release the interpreter lock
@@ -166,28 +154,8 @@ def initial_points(
 
 
 def has_surface(frame: Frame) -> NDArray[np.bool_]:
-    """(H, W) True where depth was measured and lies behind the near plane of the renderer.
-
-    Depth in meters, mistaken for millimeters, lies in front of the near plane and would never be rendered.
-    """
+    """(H, W) True where depth was measured and lies behind the near plane of the renderer; meters never do."""
     return frame.depth_valid & (frame.depth > NEAR_Z) & (frame.depth < FARTHEST_MM)
-
-
-def _sample_points(
-    frame: Frame,
-    position: int,
-    count: int | None,
-    cfg: InitConfig,
-    released: ReleasedMethod,
-    rng: np.random.Generator,
-) -> tuple[PointCloud, int]:
-    """`count` points of one frame (None: the share of its pixels that is pooled), and the number of missing points."""
-    probability = pixel_probability(frame, cfg, released.prior)
-    available = int(np.count_nonzero(probability))
-    if count is None:
-        count = min(available, max(1, int(POOL_FRACTION * available)))
-    cloud = _back_project(frame, position, sample_pixels(probability, count, rng), released.half_pixel_shift)
-    return cloud, max(0, count - available)
 
 
 def pixel_probability(frame: Frame, cfg: InitConfig, released_prior: bool = False) -> NDArray[np.float64]:
@@ -216,9 +184,7 @@ def sampling_distribution(
     at tool borders. The result is normalized exactly, which also makes it uniform if rho is zero everywhere.
 
     Args:
-        rho: (H, W) joint texture prior in [0, 1].
-        tissue_mask: (H, W) True on tissue.
-        uniform: eta_app, share of the probability spread evenly over the eroded mask.
+        rho: (H, W) joint texture prior in [0, 1]. uniform: eta_app.
     Returns:
         (H, W) probabilities that sum to 1; all 0 without tissue.
     Raises:
@@ -238,10 +204,7 @@ def sampling_distribution(
 
 
 def eroded_mask(tissue_mask: NDArray[np.bool_], size_px: int | None = None) -> NDArray[np.bool_]:
-    """The mask M eroded by an ellipse B_k of `size_px` x `size_px` px; None: `EROSION_PX`.
-
-    Pixels outside the image do not erode. Returns the mask itself if nothing would be left.
-    """
+    """The mask M eroded by an ellipse B_k of `size_px` (`EROSION_PX`), or M itself if nothing would be left."""
     size_px = EROSION_PX if size_px is None else size_px
     if size_px <= 1:
         return tissue_mask
@@ -257,17 +220,10 @@ def quotas(budget: int, num_frames: int) -> list[int]:
 
 
 def sample_pixels(weights: NDArray[np.float64], count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Weighted sampling of pixels without replacement.
+    """Flat indices, ascending, of at most `count` pixels sampled without replacement by weights (H, W) >= 0.
 
     Gives pixel i the arrival time of a Poisson process of rate weights[i] and takes the earliest: the same
     distribution as sequential sampling, in one pass (Efraimidis and Spirakis, 2006).
-
-    Args:
-        weights: (H, W) weights >= 0; pixels of weight 0 are never sampled.
-        count: number of pixels.
-        rng: source of randomness.
-    Returns:
-        (min(count, non-zero weights),) flat indices, ascending.
     """
     candidates = np.flatnonzero(weights)
     arrival = rng.standard_exponential(len(candidates)) / weights.reshape(-1)[candidates]
@@ -277,13 +233,10 @@ def sample_pixels(weights: NDArray[np.float64], count: int, rng: np.random.Gener
 
 
 def initial_log_scales(points: NDArray[np.floating], variance_factor: float = 1.0) -> NDArray[np.float32]:
-    """Log standard deviation of isotropic Gaussians, from the distance to their nearest neighbors.
+    """(N,) log standard deviation of isotropic Gaussians at points (N, 3), mm, from their 3 nearest neighbors.
 
-    Args:
-        points: (N, 3) centers, mm; repeated points count as neighbors at distance 0.
-        variance_factor: multiplies the mean squared distance.
-    Returns:
-        (N,) 0.5 log(factor * max(mean of the 3 smallest squared distances, 1e-7 mm^2)).
+    0.5 log(factor * max(mean of the 3 smallest squared distances, 1e-7 mm^2)); repeated points are at distance 0.
+
     Raises:
         ValueError: wrong shape, not finite, or fewer than 4 points.
     """
@@ -291,15 +244,6 @@ def initial_log_scales(points: NDArray[np.floating], variance_factor: float = 1.
     if len(points) < MIN_POINTS or not np.isfinite(points).all():
         raise ValueError(f"points must be at least {MIN_POINTS} finite points, got {len(points)}")
     # The nearest neighbor is the point itself or one that coincides with it: distance 0 either way.
-    distance, _ = cKDTree(points).query(points, k=MIN_POINTS)
+    distance, _ = KDTree(points).query(points, k=MIN_POINTS)
     spacing = np.maximum((distance[:, 1:] ** 2).mean(1), MIN_SQUARED_SPACING)
     return (0.5 * np.log(variance_factor * spacing)).astype(np.float32)
-
-
-def _back_project(frame: Frame, position: int, flat: NDArray[np.intp], shifted: bool) -> PointCloud:
-    """World points and colors of pixels, given by flat index, of the frame at `position`; `shifted` by half a pixel."""
-    v, u = np.divmod(flat, frame.camera.width)
-    pixels = np.stack([u, v], -1) + (0.0 if shifted else 0.5)
-    points = back_project(pixels, frame.depth[v, u].astype(np.float64), frame.camera)
-    colors = frame.rgb_u8[v, u].astype(np.float32) / np.float32(255)
-    return PointCloud(points.astype(np.float32), colors, np.full(len(points), position, np.int32))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
@@ -26,53 +26,42 @@ from ..model.motion import basis_weights
 from .neighbor_motion import CARRIERS, weights_by_distance
 from .sampling import PointCloud, concatenated, eroded_mask, has_surface
 
-CELLS = 80
-"""Columns of cells: one for 8 px of an image 640 px wide."""
-RIM_PX = 9
-"""Width of the rim along tools, in px of an image 640 px wide, whose color and depth are not continued."""
+CELLS = 80  # columns of cells: one for 8 px of an image 640 px wide
+RIM_PX = 9  # width of the rim along tools, in px of an image 640 px wide, whose color and depth are not continued
 
 
 def unseen_points(
-    frames: Sequence[Frame], cloud: PointCloud, coefficients: NDArray[np.float32] | None, cfg: BasisConfig
-) -> tuple[PointCloud, NDArray[np.float32] | None]:
+    frames: Sequence[Frame], cloud: PointCloud, coefficients: NDArray[np.float32], cfg: BasisConfig
+) -> tuple[PointCloud, NDArray[np.float32]]:
     """New points, and their temporal coefficients (M, B, 3), mm.
 
     Args:
         frames: the T training frames that the cloud comes from.
-        coefficients: (N, B, 3) motion of its points, mm; None: nothing moves.
+        coefficients: (N, B, 3) motion of its points, mm; B may be 0: nothing moves.
     """
-    found, motions = [], []
     size = _cell_size(frames[0])
     within = convex_hull(np.any([_cell_sums(frame.tissue_mask, size) > 0 for frame in frames], axis=0))
+    found, motions = [], [coefficients[:0]]
     for position, frame in enumerate(frames):
-        weights = basis_weights(frame.time, cfg) if coefficients is not None else np.zeros(0)
-        moved = _moved(cloud.points, coefficients, weights)
-        added = [_moved(part.points, motion, weights) for part, motion in zip(found, motions, strict=True)]
+        weights = basis_weights(frame.time, cfg) if coefficients.shape[1] else np.zeros(0)
+        moved = cloud.points + _displacement(coefficients, weights)
+        added = [part.points + _displacement(motion, weights) for part, motion in zip(found, motions[1:], strict=True)]
         new, colors = _fill(frame, np.concatenate([moved, *added]), within)
         if not len(new):
             continue
-        motion = None
-        if coefficients is not None:
-            motion = _carried(moved, coefficients, new)
-            new = new - _moved(np.zeros_like(new), motion, weights)
-        origins = np.full(len(new), position, np.int32)
-        found.append(PointCloud(new.astype(np.float32), colors.astype(np.float32), origins))
+        distances, nearest = KDTree(moved).query(new, k=min(CARRIERS, len(moved)))
+        near = weights_by_distance(np.reshape(distances, (len(new), -1)).astype(np.float64))
+        carriers = coefficients[np.reshape(nearest, (len(new), -1))]
+        motion = np.einsum("mk,mkbc->mbc", near, carriers).astype(np.float32)
+        points = (new - _displacement(motion, weights)).astype(np.float32)
+        found.append(PointCloud(points, colors.astype(np.float32), np.full(len(new), position, np.int32)))
         motions.append(motion)
-    if coefficients is None:
-        return concatenated(found), None
-    return concatenated(found), np.concatenate([*motions, coefficients[:0]])
+    return concatenated(found), np.concatenate(motions)
 
 
-def _moved(points: NDArray, coefficients: NDArray | None, weights: NDArray) -> NDArray:
-    """(N, 3) where points are at the time of the `weights` (B,)."""
-    return points if coefficients is None else points + np.tensordot(coefficients, weights, (1, 0))
-
-
-def _carried(points: NDArray, coefficients: NDArray, new: NDArray) -> NDArray[np.float32]:
-    """(M, B, 3) coefficients of `new` points (M, 3) from those of the nearest `points` (N, 3)."""
-    count = min(CARRIERS, len(points))
-    distances, nearest = cKDTree(points).query(new, k=np.arange(1, count + 1))
-    return np.einsum("mk,mkbc->mbc", weights_by_distance(distances), coefficients[nearest]).astype(np.float32)
+def _displacement(coefficients: NDArray, weights: NDArray) -> NDArray:
+    """(N, 3) mm, at the time of the `weights` (B,)."""
+    return np.tensordot(coefficients, weights, (1, 0))
 
 
 def _cell_size(frame: Frame) -> int:
@@ -139,25 +128,21 @@ def laplace_fill(values: NDArray, known: NDArray[np.bool_]) -> NDArray[np.float6
     if not known.any():
         raise ValueError("laplace_fill: nothing is known")
     filled = np.where(known[..., None], values, 0.0)
-    number = np.full(known.shape, -1)
-    open_rows, open_columns = np.nonzero(~known)
-    count = len(open_rows)
-    number[open_rows, open_columns] = np.arange(count)
-    right, entries, degree = np.zeros((count, values.shape[-1])), [], np.zeros(count)
+    rows, columns = np.nonzero(~known)
+    count, every = len(rows), np.arange(len(rows))
+    if not count:
+        return filled
+    number = np.full(np.add(known.shape, 2), -2)  # -2 beyond the image, -1 where known
+    number[1:-1, 1:-1] = -1
+    number[rows + 1, columns + 1] = every
+    right, degree, entries = np.zeros((count, values.shape[-1])), np.zeros(count), [(every, every)]
     for step_y, step_x in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        y, x = open_rows + step_y, open_columns + step_x
-        inside = (y >= 0) & (y < known.shape[0]) & (x >= 0) & (x < known.shape[1])
-        own, y, x = np.arange(count)[inside], y[inside], x[inside]
-        degree[own] += 1
-        border = known[y, x]
-        right[own[border]] += filled[y[border], x[border]]
-        entries.append((own[~border], number[y[~border], x[~border]]))
+        other = number[rows + 1 + step_y, columns + 1 + step_x]
+        degree += other > -2
+        border, inner = np.flatnonzero(other == -1), np.flatnonzero(other >= 0)
+        right[border] += filled[rows[border] + step_y, columns[border] + step_x]
+        entries.append((inner, other[inner]))
     own, other = (np.concatenate(part) for part in zip(*entries, strict=True))
-    every = np.arange(count)
-    matrix = coo_matrix(
-        (np.concatenate([degree, -np.ones(len(own))]), (np.concatenate([every, own]), np.concatenate([every, other]))),
-        shape=(count, count),
-    )
-    if count:
-        filled[open_rows, open_columns] = spsolve(matrix.tocsc(), right).reshape(count, -1)
+    matrix = coo_matrix((np.concatenate([degree, -np.ones(len(own) - count)]), (own, other)), shape=(count, count))
+    filled[rows, columns] = spsolve(matrix.tocsc(), right).reshape(count, -1)
     return filled

@@ -1,5 +1,6 @@
 """The temporal basis in Numba: reads only the few basis functions with a weight. CPU, float32 or float64."""
 
+# pyright: reportCallIssue=false
 from __future__ import annotations
 
 import numpy as np

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..core.types import Camera
@@ -29,10 +29,8 @@ for each px by which they disagree. Fitted to two phantoms (docs/log.md)."""
 class CarriedPoints:
     """P points at T times."""
 
-    positions: NDArray[np.float32]
-    """(T, P, 3) world, mm."""
-    confidence: NDArray[np.float32]
-    """(T, P) in [0, 1]: by `confidence_of`; greatest in the point's own frame, less in each window further on."""
+    positions: NDArray[np.float32]  # (T, P, 3) world, mm
+    confidence: NDArray[np.float32]  # (T, P) in [0, 1]; greatest in the point's own frame, less in each further window
 
 
 def carry_points(
@@ -96,7 +94,7 @@ def _carry_in(
     for start in np.unique(from_stop):
         tied = from_stop == start
         centers = _centers(scene, scene.gaussians, times[start])
-        found = cKDTree(centers).query(points[tied], k=k, workers=1)
+        found = KDTree(centers).query(points[tied], k=k, workers=1)
         distances[tied], carriers[tied] = (part.reshape(-1, k) for part in found)
     opacities = scene.gaussians.opacities.detach().cpu().numpy()
     width = np.maximum(distances.mean(1, keepdims=True), 1e-6)

@@ -24,7 +24,7 @@ from ..core.types import Splats
 from .method import method_of
 
 if TYPE_CHECKING:
-    from .motion import Offsets, RankOneGradient, UnstoredGradient
+    from .motion import Gradient, Offsets
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Attribute:
     name: str
     width: int
     """Numbers per Gaussian that a deformation may add an offset to: 3 for colors, whatever their degree."""
-    changes: Callable[[DeformationConfig], bool] = lambda cfg: False
+    changes: Callable[[DeformationConfig], bool] = lambda _: False
     """Whether it changes with time."""
 
 
 ATTRIBUTES = (
-    Attribute("means", 3, lambda cfg: True),
+    Attribute("means", 3, lambda _: True),
     Attribute("quats", 4, lambda cfg: cfg.deform_shape),
     Attribute("log_scales", 3, lambda cfg: cfg.deform_shape),
     Attribute("opacity_logits", 1, lambda cfg: cfg.deform_opacity),
@@ -100,7 +100,7 @@ class Gaussians:
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         self.tensors = {name: value.detach().contiguous().requires_grad_() for name, value in tensors.items()}
-        self.motion_gradients: list[RankOneGradient] | list[UnstoredGradient] = []
+        self.motion_gradients: list[Gradient] = []
         """Gradient of what moves them since the last optimizer step, one entry per time step."""
 
     def to(self, device: torch.device | str) -> Gaussians:

@@ -60,18 +60,12 @@ def plane_shapes(cfg: HexPlaneConfig) -> list[dict[str, tuple[int, int]]]:
 class Layout(NamedTuple):
     """Where the planes lie in `PlaneGrid.values`; `S` scales, `R` columns of all time planes."""
 
-    resolution: Tensor
-    """(S, 3) float32 cells along x, y, z."""
-    space_start: Tensor
-    """(S, 3) first cell of the planes xy, xz, yz."""
-    space_width: Tensor
-    """(S, 3) cells from one row of the planes xy, xz, yz to the next."""
-    table_start: Tensor
-    """(S, 3) first column of the planes xt, yt, zt."""
-    time_first: Tensor
-    """(R,) cell that holds each column of the time planes in their first row."""
-    time_step: Tensor
-    """(R,) cells from one row of that column to the next."""
+    resolution: Tensor  # (S, 3) float32 cells along x, y, z
+    space_start: Tensor  # (S, 3) first cell of the planes xy, xz, yz
+    space_width: Tensor  # (S, 3) cells from one row of these planes to the next
+    table_start: Tensor  # (S, 3) first column of the planes xt, yt, zt
+    time_first: Tensor  # (R,) cell that holds each column of the time planes in their first row
+    time_step: Tensor  # (R,) cells from one row of that column to the next
 
 
 class PlaneGrid:
@@ -189,15 +183,13 @@ class PlaneGrid:
 def hexplane_linear(
     grid: PlaneGrid, unit: Tensor, times: tuple[float, ...], weight: Tensor, bias: Tensor
 ) -> tuple[Tensor, ...]:
-    """A linear layer on the features at one or more times.
+    """A linear layer on the features at one or more times; backward also adds to `grid.grads`.
 
     Args:
         unit: (N, 3) float32 positions, 0..1 from the first to the second corner of the box; clamped outside.
         times: M of them in [0, 1]. weight: (W, S * C). bias: (W,).
     Returns:
-        (N, W) float32 per time. With gradients enabled, backward also adds to `grid.grads`.
-    Raises:
-        ValueError: a wrong shape.
+        (N, W) float32 per time.
     """
     check_shape(f"unit:N,3 weight:W,{grid.num_features} bias:W", unit=unit, weight=weight, bias=bias)
     return tuple(linear(found, weight, bias) for found in features(grid, unit, times))

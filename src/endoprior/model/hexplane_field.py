@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from copy import copy
-from typing import ClassVar, Self
+from typing import ClassVar, Self, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import linear, relu
 from torch.nn.init import xavier_uniform_
+from typing_extensions import override
 
 from ..core.checks import InputError, check_shape
 from ..core.config import Config
@@ -44,13 +45,11 @@ class HexPlaneField(Field):
         draw: bool = True,
         zero_biases: bool = False,
     ) -> None:
-        """Start a field.
-
-        Args:
-            box: (2, 3) corners, mm, in the order [max, min]; `box_of_points` makes one.
-            generator: source of all random numbers: space planes first, then trunk and heads.
-            draw: False leaves the planes at 1.
-            zero_biases: biases of trunk and heads start at 0 (released code).
+        """Args:
+        box: (2, 3) corners, mm, in the order [max, min]; `box_of_points` makes one.
+        generator: source of all random numbers: space planes first, then trunk and heads.
+        draw: False leaves the planes at 1.
+        zero_biases: biases of trunk and heads start at 0 (released code).
         """
         check_shape("box:2,3", box=box)
         self.cfg = cfg
@@ -79,21 +78,13 @@ class HexPlaneField(Field):
 
     @classmethod
     def from_state_arrays(cls, arrays: Mapping[str, Tensor], cfg: DeformationConfig) -> Self:
-        """The field whose `state_arrays` these are.
-
-        Raises:
-            InputError: an array is missing or has another shape.
-        """
+        """See `Motion.field_of`."""
         field = cls(torch.tensor([[1.0] * 3, [0.0] * 3]), cfg, torch.Generator(), draw=False)
         field.load_state_arrays(arrays)
         return field
 
     def to(self, device: torch.device | str, *, fp16_planes: bool = False) -> HexPlaneField:
-        """This field on a device; itself if it is there. A copy starts without gradients.
-
-        Args:
-            fp16_planes: keep the planes in half precision, on any device but the CPU: for rendering only.
-        """
+        """See `Field.to`."""
         device = torch.device(device)
         if self.box.device.type == device.type and not fp16_planes:
             return self
@@ -113,14 +104,18 @@ class HexPlaneField(Field):
             Offsets with a gradient path to `means`, the box and the network; the planes' gradient goes to `grid.grads`.
         """
         (trunk,) = self.trunk(means, (time,), ops)
-        return Offsets.from_channels(self.heads(trunk, ops), self.cfg)
+        return Offsets.from_channels(self._heads(trunk, ops), self.cfg)
 
     def offsets_and_displacement(
         self, means: Tensor, time: float, other: float, ops: ModelOps
     ) -> tuple[Offsets, Tensor]:
         """`offsets` at `time`, and those of the centers alone, (N, 3) mm, at an `other` time: faster than two calls."""
         here, there = self.trunk(means, (time, other), ops)
-        return Offsets.from_channels(self.heads(here, ops), self.cfg), self.heads(there, ops, ("means",))["means"]
+        return Offsets.from_channels(self._heads(here, ops), self.cfg), self._heads(there, ops, ("means",))["means"]
+
+    def _heads(self, trunk: Tensor, ops: ModelOps, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
+        assert isinstance(self.heads, OffsetHeads)
+        return self.heads(trunk, ops, only)
 
     def trunk(self, means: Tensor, times: tuple[float, ...], ops: ModelOps) -> tuple[Tensor, ...]:
         """Output of the trunk on the features, (N, W) per time."""
@@ -162,11 +157,7 @@ class HexPlaneField(Field):
         return arrays | {f"heads.{name}": value.detach() for name, value in self.heads.parameters.items()}
 
     def load_state_arrays(self, arrays: Mapping[str, Tensor]) -> None:
-        """Copy in what `state_arrays` gave; other names in `arrays` are ignored.
-
-        Raises:
-            InputError: an array is missing or has another shape.
-        """
+        """Copy in what `state_arrays` gave; InputError if an array is missing or has another shape."""
         for name, target in self.state_arrays().items():
             found = arrays.get(name)
             if found is None or found.shape != target.shape:
@@ -204,10 +195,11 @@ class HexPlaneMotion(Motion):
         """See `Motion.planes`."""
         return cfg.deformation.hexplane
 
+    @override
     def offsets(
         self,
         gaussians: Gaussians,
-        field: HexPlaneField,
+        field: Field | None,
         time: float,
         cfg: Config,
         ops: ModelOps,
@@ -215,7 +207,7 @@ class HexPlaneMotion(Motion):
     ) -> Offsets:
         """See `Motion.offsets`."""
         means = gaussians["means"]
-        return field.offsets(means if chosen is None else means[chosen], time, ops)
+        return cast("HexPlaneField", field).offsets(means if chosen is None else means[chosen], time, ops)
 
 
 class LinearLayers:
@@ -224,11 +216,10 @@ class LinearLayers:
     def __init__(
         self, shapes: dict[str, tuple[int, int]], generator: torch.Generator, zero_biases: bool = False
     ) -> None:
-        """Draw the weights from `generator`.
+        """Draw weights, and biases from U[-1, 1] / sqrt(inputs) as PyTorch does, unless they start at 0.
 
         Args:
             shapes: outputs and inputs of each layer by name.
-            zero_biases: biases are 0; else drawn from U[-1, 1] / sqrt(inputs) as PyTorch does.
         """
         self.parameters: dict[str, Tensor] = {}
         for layer, (fan_out, fan_in) in shapes.items():

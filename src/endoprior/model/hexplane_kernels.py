@@ -23,6 +23,7 @@ that lie near each other should follow each other.
 All sums run in an order that the number of threads does not change, so equal inputs give equal bits.
 """
 
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false
 from __future__ import annotations
 
 import numpy as np

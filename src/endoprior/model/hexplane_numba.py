@@ -7,6 +7,7 @@ Letters: `N` positions, `n` those of one chunk, `M` times, `F` features, `W` out
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import Any
 
 import numba
@@ -127,7 +128,7 @@ class _Linear(torch.autograd.Function):
             ctx.lookup.scatter(unit[rows], features, v_unit[rows])
             v_weight.addmm_(v_made.T, features.flatten(0, 1))
         ctx.lookup.finish_backward()
-        v_bias = sum(v_time.sum(0) for v_time in v_out)
+        v_bias = reduce(torch.add, (v_time.sum(0) for v_time in v_out))
         return v_unit, v_weight, v_bias, None, None
 
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..core.checks import InputError
@@ -79,11 +79,12 @@ def _refitted_scene(scene: SingleScene, frames: Iterable[Frame]) -> SingleScene:
         sh_dc[some, 0], motion[some, :, part] = _refitted(
             sh_dc[some, 0], motion[some][:, :, part], basis, weights[some]
         )
-    means, known = tensors["means"].detach().cpu().numpy(), np.nansum(free, axis=1) >= LEAST_FRAMES
-    never_seen = np.isnan(free).all(1)
+    means = tensors["means"].detach().cpu().numpy()
+    known = np.asarray(np.nansum(free, axis=1) >= LEAST_FRAMES)
+    never_seen = np.asarray(np.isnan(free).all(1))
     unseen = torch.from_numpy(never_seen).to(motion.device)
     for new, old in ((sh_dc, tensors["sh_dc"]), (motion[:, :, part], tensors["motion"][:, :, part])):
-        _take_from_neighbors(means, known, touched & ~known, new)
+        _take_from_neighbors(means, known, np.asarray(touched & ~known), new)
         taken = new - old.detach()
         _take_from_neighbors(means, ~never_seen, never_seen, taken)
         new[unseen] += taken[unseen]
@@ -141,7 +142,7 @@ def _take_from_neighbors(
     if not unknown.any() or not known.any():
         return
     rows = np.flatnonzero(known)
-    # A list, so that one neighbor has an axis of its own too.
-    _, nearest = cKDTree(means[rows]).query(means[unknown], [*range(1, min(NEIGHBORS, len(rows)) + 1)])
-    nearest = torch.from_numpy(rows[nearest]).to(values.device)
+    k = min(NEIGHBORS, len(rows))
+    _, nearest = KDTree(means[rows]).query(means[unknown], k)
+    nearest = torch.from_numpy(rows[np.reshape(nearest, (-1, k))]).to(values.device)
     values[torch.from_numpy(unknown).to(values.device)] = values[nearest].mean(1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..core.geometry import back_project, pixel_centers
 from .carry import carry_points
@@ -28,27 +28,19 @@ THINNEST = 1e-3
 class Measures:
     """What is measured of `P` points, in each of `T` frames; NaN where unknown."""
 
-    since: int
-    """Frame that displacement and stretch refer to."""
-    distance: NDArray[np.float64]
-    """(T,) between the first two points; NaN for a single one."""
-    area: NDArray[np.float64]
-    """(T,) of the polygon of all points; NaN for fewer than three, and where its edges cross."""
-    path_length: NDArray[np.float64]
-    """(T, P) since frame 0, of the smoothed path."""
-    path_length_raw: NDArray[np.float64]
-    """(T, P) the same without smoothing: jitter counts."""
-    displacement: NDArray[np.float64]
-    """(T, P) distance from the position in frame `since`."""
-    stretch: NDArray[np.float64]
-    """(T, P) largest principal stretch of the surface around the point since frame `since`; 1: unchanged."""
+    since: int  # frame that displacement and stretch refer to
+    distance: NDArray[np.float64]  # (T,) between the first two points
+    area: NDArray[np.float64]  # (T,) of the polygon of all points; NaN where its edges cross
+    path_length: NDArray[np.float64]  # (T, P) since frame 0, of the smoothed path
+    path_length_raw: NDArray[np.float64]  # (T, P) without smoothing: jitter counts
+    displacement: NDArray[np.float64]  # (T, P) distance from the position in frame `since`
+    stretch: NDArray[np.float64]  # (T, P) largest principal stretch of the surface around the point; 1: unchanged
 
 
 def measures_of(paths: NDArray, stretch: NDArray, since: int, drawn: int) -> Measures:
-    """Every measure of carried points.
+    """Every measure of carried points: paths (T, P, 3), stretch (T, P).
 
     Args:
-        paths: (T, P, 3). stretch: (T, P).
         since: frame that displacement refers to. drawn: frame in which the polygon is cut into triangles.
     """
     paths = paths.astype(np.float64)
@@ -134,7 +126,7 @@ def neighborhoods(points: NDArray, samples: NDArray) -> tuple[NDArray[np.intp], 
         sample is no farther from it than its samples scatter.
     """
     k = min(NUM_NEIGHBORS, len(samples))
-    far, nearest = cKDTree(samples).query(points, k=k, workers=1)
+    far, nearest = KDTree(samples).query(points, k=k, workers=1)
     far, nearest = far.reshape(len(points), k), nearest.reshape(len(points), k)
     around = samples[nearest]
     scatter = np.sqrt(np.square(around - around.mean(1, keepdims=True)).sum(-1).mean(1))
@@ -154,11 +146,11 @@ def principal_stretches(before: NDArray, after: NDArray) -> NDArray[np.float64]:
         (..., 2) largest and smallest: length after over length before, along two perpendicular directions; NaN where a
         point is unknown, or all lie on a line.
     """
-    known = np.isfinite(before).all((-2, -1)) & np.isfinite(after).all((-2, -1))
+    known = np.asarray(np.isfinite(before).all((-2, -1)) & np.isfinite(after).all((-2, -1)))
     before, after = (np.where(known[..., None, None], points, 0.0) for points in (before, after))
     before, after = (points - points.mean(-2, keepdims=True) for points in (before, after))
     variances, axes = np.linalg.eigh(np.swapaxes(before, -1, -2) @ before)  # ascending: the normal comes first
-    known &= variances[..., 1] > THINNEST * variances[..., 2]
+    known = known & (variances[..., 1] > THINNEST * variances[..., 2])
     scale = np.where(known[..., None], variances[..., 1:], 1.0)
     gradient = np.swapaxes(after, -1, -2) @ (before @ axes[..., 1:]) / scale[..., None, :]
     return np.where(known[..., None], np.linalg.svd(gradient, compute_uv=False), np.nan)
@@ -211,15 +203,12 @@ class SurfaceMotion:
         return frame / len(self._scene.cameras)
 
     def stretch(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """Largest principal stretch around points since the frame of the surface.
+        """(F, P) largest principal stretch, in each of `frames`, around points (P, 3), mm, of the surface's frame.
 
-        Args:
-            points: (P, 3) where they are in that frame, mm.
-        Returns:
-            (F, P) for each of `frames`; 1: unchanged. NaN for points that are not on the surface.
+        1: unchanged; NaN for points that are not on the surface.
         """
         found = np.full((len(frames), len(points)), np.nan)
-        on_surface = np.isfinite(points).all(1)
+        on_surface = np.asarray(np.isfinite(points).all(1))
         if not len(self.samples) or not on_surface.any():
             return found
         nearest, around = neighborhoods(points[on_surface], self.samples)

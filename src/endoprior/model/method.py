@@ -47,11 +47,7 @@ class Method(ABC):
 
     @abstractmethod
     def trainer(self, sequence: FrameSequence, cfg: Config) -> Trainer:
-        """A training that has not computed anything yet.
-
-        Raises:
-            InputError: the sequence or the config cannot be used.
-        """
+        """A training that has not computed anything; InputError if the sequence or the config cannot be used."""
 
     @abstractmethod
     def schema(self, cfg: Config) -> dict[str, ArraySpec]:
@@ -59,18 +55,10 @@ class Method(ABC):
 
     @abstractmethod
     def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> RenderedScene:
-        """The scene whose arrays these are; they fit `schema`.
-
-        Raises:
-            InputError: a value that no scene can have.
-        """
+        """The scene whose arrays these are; they fit `schema`. InputError: a value that no scene can have."""
 
     def motion(self, cfg: Config) -> Motion:
-        """How its Gaussians move.
-
-        Raises:
-            TypeError: it has no Gaussians.
-        """
+        """How its Gaussians move; TypeError if it has none."""
         raise TypeError(f"{cfg.method} has no Gaussians")
 
 

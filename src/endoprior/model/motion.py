@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 from ..core.checks import check_shape
 from ..core.config import Config
@@ -108,6 +109,7 @@ class Motion(ABC):
         Raises:
             InputError: the config leaves a shape open.
         """
+        del cfg  # for subclasses
         return {}
 
     def first_tensors(self, num: int, cfg: Config) -> dict[str, Tensor]:
@@ -116,6 +118,7 @@ class Motion(ABC):
 
     def field(self, points: Tensor, cfg: Config) -> Field | None:
         """The field around the initial points (N, 3), mm, before training; None: no field."""
+        del points, cfg  # for subclasses
         return None
 
     def field_of(self, arrays: Mapping[str, Tensor], cfg: Config) -> Field | None:
@@ -124,18 +127,22 @@ class Motion(ABC):
         Raises:
             InputError: an array is missing or has another shape.
         """
+        del arrays, cfg  # for subclasses
         return None
 
     def field_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
         """Shapes of the field's `state_arrays`."""
+        del cfg  # for subclasses
         return {}
 
     def parameter_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
         """Shapes of the field's `parameters`."""
+        del cfg  # for subclasses
         return {}
 
     def planes(self, cfg: Config) -> HexPlaneConfig | None:
         """The planes of the field, if it has some."""
+        del cfg  # for subclasses
         return None
 
     @abstractmethod
@@ -171,10 +178,11 @@ class BasisMotion(Motion):
         """See `Motion.tensors`."""
         return {"motion": motion_shape(cfg.deformation)}
 
+    @override
     def offsets(
         self,
         gaussians: Gaussians,
-        field: None,
+        field: Field | None,
         time: float,
         cfg: Config,
         ops: ModelOps,
@@ -195,7 +203,11 @@ def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
 
 
 def basis_offsets(
-    motion: Tensor, time: float, cfg: DeformationConfig, ops: ModelOps, sink: list[RankOneGradient] | None = None
+    motion: Tensor,
+    time: float,
+    cfg: DeformationConfig,
+    ops: ModelOps,
+    sink: list[RankOneGradient | UnstoredGradient] | None = None,
 ) -> Offsets:
     """Offsets at `time` of Gaussians with coefficients `motion`, differentiable in `motion`.
 
@@ -252,12 +264,16 @@ class UnstoredGradient(ABC):
         """
 
 
+Gradient = RankOneGradient | UnstoredGradient
+"""What a time step leaves for the optimizer."""
+
+
 class _WeightedSum(torch.autograd.Function):
     """sum_b weights[b] * motion[:, b]."""
 
     @staticmethod
     def forward(
-        ctx: Any, motion: Tensor, weights: NDArray[np.float64], sink: list[RankOneGradient] | None, ops: ModelOps
+        ctx: Any, motion: Tensor, weights: NDArray[np.float64], sink: list[Gradient] | None, ops: ModelOps
     ) -> Tensor:
         ctx.weights, ctx.sink, ctx.ops = weights, sink, ops
         return ops.weighted_sum(motion.detach(), weights)

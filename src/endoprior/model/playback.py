@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import torch
@@ -33,12 +34,7 @@ class Playback:
     """
 
     def __init__(self, scene: Scene, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
-        """Start with an empty cache.
-
-        Args:
-            scene: what to play.
-            max_bytes: for all cached frames together; at least one frame is always cached.
-        """
+        """Args: max_bytes: for all cached frames together; at least one frame is always cached."""
         self.scene, self.max_bytes = scene, max_bytes
         self._kept: OrderedDict[int, list[tuple[Splats, float]]] = OrderedDict()
 
@@ -46,11 +42,7 @@ class Playback:
         return len(self.scene.cameras)
 
     def splats(self, index: int) -> Splats:
-        """The Gaussians of frame `index`, activated; see `Scene.at`.
-
-        Raises:
-            IndexError: no such frame.
-        """
+        """The Gaussians of frame `index`, activated; see `Scene.at`."""
         return joined([faded(splats, weight) for splats, weight in self._parts(index)])
 
     def _parts(self, index: int) -> list[tuple[Splats, float]]:
@@ -110,7 +102,8 @@ def mixed(views: Sequence[tuple[RenderedView, float]]) -> RenderedView:
     if len(views) == 1:
         return views[0][0]
     names = [field.name for field in fields(RenderedView)]
-    return RenderedView(*(sum(weight * getattr(view, name) for view, weight in views) for name in names))
+    parts = ([weight * getattr(view, name) for view, weight in views] for name in names)
+    return RenderedView(*(reduce(torch.add, part) for part in parts))
 
 
 def faded(splats: Splats, weight: float) -> Splats:

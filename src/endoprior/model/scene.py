@@ -29,12 +29,9 @@ if TYPE_CHECKING:
 class Window:
     """A span of frames with Gaussians of its own."""
 
-    start: int
-    """Its first frame, counted over the sequence."""
-    stop: int
-    """The frame after its last one."""
-    load: Callable[[], SingleScene]
-    """Gives its scene, which may be read from a file then."""
+    start: int  # its first frame, counted over the sequence
+    stop: int  # the frame after its last one
+    load: Callable[[], SingleScene]  # gives its scene, which may be read from a file then
 
     @property
     def scene(self) -> SingleScene:
@@ -47,10 +44,8 @@ class Shown:
     """A window that a scene shows at some time."""
 
     window: Window
-    time: float
-    """That time in the window's own scene, in [0, 1]."""
-    weight: float
-    """In (0, 1]: 1 unless two windows overlap there. The weights of all windows add up to 1."""
+    time: float  # that time in the window's own scene, in [0, 1]
+    weight: float  # in (0, 1]: 1 unless two windows overlap there; they add up to 1
 
 
 class RenderedScene(ABC):
@@ -86,7 +81,11 @@ class RenderedScene(ABC):
 
     @abstractmethod
     def save(self, path: Path) -> None:
-        """Write the scene as safetensors, completely or not at all."""
+        """Write the scene as safetensors, completely or not at all.
+
+        Raises:
+            ValueError: its planes are in half precision.
+        """
 
     @abstractmethod
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
@@ -127,14 +126,6 @@ class Scene(RenderedScene):
     def changed(self, change: Callable[[SingleScene, Window], SingleScene]) -> Scene:
         """A scene whose windows are what `change` makes of the scene of each; possibly only when they are shown."""
 
-    @abstractmethod
-    def save(self, path: Path) -> None:
-        """Write the scene as safetensors, completely or not at all.
-
-        Raises:
-            ValueError: its planes are in half precision.
-        """
-
     def shown_at(self, time: float) -> list[Shown]:
         """The windows that the scene shows at `time`: one, or the two that overlap there.
 
@@ -154,11 +145,7 @@ class Scene(RenderedScene):
 
     @torch.no_grad()
     def parts_at(self, time: float) -> list[tuple[Splats, float]]:
-        """The Gaussians, activated, of each window that shows at `time`, and its weight.
-
-        Raises:
-            ValueError: time is not in [0, 1].
-        """
+        """The Gaussians, activated, of each window that shows at `time` in [0, 1], and its weight."""
         return [(part.window.scene.at(part.time), part.weight) for part in self.shown_at(time)]
 
     def at(self, time: float) -> Splats:
@@ -175,25 +162,12 @@ class Scene(RenderedScene):
 
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
-        """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
-
-        Where two windows show, it is the weighted mean of the pictures of both.
-
-        Returns:
-            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, alpha (H, W) in [0, 1), and
-            unclamped_color (H, W, 3).
-        Raises:
-            ValueError: time is not in [0, 1].
-        """
+        """See `RenderedScene.render`; where two windows show, the weighted mean of the pictures of both."""
         return rendered(self.parts_at(time), camera or self.camera_at(time), self.backend, self.background)
 
     @torch.no_grad()
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
-        """`render` at several times, one camera each, in one call where the backend can: faster on a GPU.
-
-        Raises:
-            ValueError: a time is not in [0, 1], or cameras differ in size where the backend renders them together.
-        """
+        """`render` at several times, in one call where the backend can, of cameras of one size: faster on a GPU."""
         return rendered_many([self.parts_at(time) for time in times], cameras, self.backend, self.background)
 
     @cached_property

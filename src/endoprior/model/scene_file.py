@@ -62,7 +62,7 @@ def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     return method_of(cfg).schema(cfg) | CAMERAS
 
 
-def index_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
+def index_schema(_about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a list of `K` windows."""
     return CAMERAS | {"windows": ArraySpec("int64", ("K", 3))}
 
@@ -98,7 +98,8 @@ def _check_cameras(arrays: Mapping[str, Tensor]) -> None:
 def _cameras(arrays: Mapping[str, Tensor], facts: SceneFacts) -> tuple[Camera, ...]:
     intrinsics, poses = arrays["camera.intrinsics"].numpy(), arrays["camera.world_to_camera"].numpy()
     return tuple(
-        Camera(facts.width, facts.height, *map(float, k), pose) for k, pose in zip(intrinsics, poses, strict=True)
+        Camera(facts.width, facts.height, float(fx), float(fy), float(cx), float(cy), pose)
+        for (fx, fy, cx, cy), pose in zip(intrinsics, poses, strict=True)
     )
 
 
@@ -111,7 +112,8 @@ def _windowed(arrays: dict[str, Tensor], facts: SceneFacts, file: Path) -> Windo
         scene, length = load_scene(window), span.stop - span.start
         if isinstance(scene, SingleScene) and (len(scene.cameras), len(scene)) == (length, span.num_gaussians):
             return scene
-        got = f"{len(scene.cameras)} frames and {len(scene):,} Gaussians"
+        count = f"{len(scene):,}" if isinstance(scene, SingleScene) else "no"
+        got = f"{len(scene.cameras)} frames and {count} Gaussians"
         raise input_error(
             window, f"{length} frames and {span.num_gaussians:,} Gaussians, as {file} says", got, NEXT_STEP
         )

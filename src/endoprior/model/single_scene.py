@@ -33,20 +33,17 @@ class SingleScene(Scene):
     """What they share to move, if the method has such a thing."""
     config: Config
     cameras: tuple[Camera, ...]
-    """Camera of each frame of the sequence; frame i was taken at time i / T."""
     frames_per_second: float
     prior_score: Tensor
     """(N,) texture-prior score of each Gaussian."""
     num_valid: Tensor
     """(N,) projections that score was averaged over."""
     lengths_are_relative: bool = False
-    """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
     trained_from: float = 0.0
     """Time of the first frame that motion was trained on; before it, motion is what it is then ..."""
     trained_until: float = 1.0
     """... and after this one too: a temporal basis that nothing holds leads anywhere."""
     rendered_by: render.Backend | None = None
-    """Rendering backend; None: the one it was trained with, where it can be used."""
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -142,11 +139,7 @@ class SingleScene(Scene):
         )
 
     def save(self, path: Path) -> None:
-        """Write the scene as one safetensors file, completely or not at all.
-
-        Raises:
-            ValueError: its planes are in half precision.
-        """
+        """See `Scene.save`."""
         if self.field is not None and self.field.grid is not None and self.field.grid.values.dtype != torch.float32:
             raise ValueError("save the scene itself, not a copy with fp16 planes")
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}

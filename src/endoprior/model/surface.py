@@ -22,12 +22,10 @@ HIDDEN_SHARE = 0.04
 
 @dataclass(frozen=True)
 class Surface:
-    """What one camera sees."""
+    """What one camera sees; 0 where no surface is rendered."""
 
-    depth: NDArray[np.float32]
-    """(H, W) z, mm; 0 where no surface is rendered."""
-    color: NDArray[np.float32]
-    """(H, W, 3) in [0, 1], without the background; 0 where no surface is rendered."""
+    depth: NDArray[np.float32]  # (H, W) z, mm
+    color: NDArray[np.float32]  # (H, W, 3) in [0, 1], without the background
     camera: Camera
 
 

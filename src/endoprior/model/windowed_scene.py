@@ -86,7 +86,7 @@ class WindowedScene(Scene):
         return replace(self, read=lambda k: change(windows[k].scene, windows[k]))
 
     def save(self, path: Path) -> None:
-        """Write the list of windows to `path`, and the windows below `windows/` beside it."""
+        """See `Scene.save`: the list of windows, and the windows below `windows/` beside it."""
         for k, window in enumerate(self.windows):
             file = window_file(path, k)
             file.parent.mkdir(parents=True, exist_ok=True)

@@ -96,10 +96,9 @@ class PhantomConfig:
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
-        for name, known in (("instruments", Instruments), ("tissue", Tissue)):
-            if getattr(self, name) not in get_args(known):
-                fix = "Choose one of these."
-                raise input_error(name, f"one of {', '.join(get_args(known))}", repr(getattr(self, name)), fix)
+        for name, known in (("instruments", get_args(Instruments)), ("tissue", get_args(Tissue))):
+            if getattr(self, name) not in known:
+                raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
         if self.width * self.height * share > MOST_PIXELS:

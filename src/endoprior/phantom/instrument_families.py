@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .graspers import JAW_MM
 from .instrument_light import Material
 from .instrument_shapes import JAWS, LOWER, SHAFT, UPPER, Part, bar, pin, rod, tube
 from .instrument_tracing import Instrument
@@ -17,7 +18,7 @@ from .instrument_tracing import Instrument
 Color = tuple[float, float, float]
 _FAR_MM = 400.0
 """Where shafts end, outside of every image."""
-_BENT = 0.89
+_BENT = (1.0, 0.89)
 """Bend of a wrist: as that of the graspers."""
 
 
@@ -45,9 +46,19 @@ def _shaft(material: int, start: float, radius: float, rounding: float = 0.4) ->
     return tube(SHAFT, material, (start, _FAR_MM), (radius, radius), rounding)
 
 
-def _pair(material: int, *shape: object, **more: object) -> tuple[Part, Part]:
-    """Two equal jaws."""
-    return bar(UPPER, material, *shape, **more), bar(LOWER, material, *shape, **more)
+def _pair(
+    material: int,
+    span: tuple[float, float],
+    half_widths: tuple[float, float],
+    thickness: tuple[float, float],
+    rounding: float = 0.5,
+    lift: float = 0.0,
+    bend: tuple[float, float] = (0, 0),
+    window: tuple[float, float, float] = (0, 0, 0),
+) -> tuple[Part, ...]:
+    """Two equal jaws; see `bar`."""
+    shape = span, half_widths, thickness, rounding, lift, bend, window
+    return tuple(bar(axes, material, *shape) for axes in (UPPER, LOWER))
 
 
 def _fork(material: int, radius: float, stop: float) -> tuple[Part, Part]:
@@ -151,6 +162,14 @@ def _blue() -> tuple[Instrument, Instrument]:
     )
 
 
+def _graspers() -> tuple[Instrument, Instrument]:
+    colors = ((0.72, 0.70, 0.67), (0.050, 0.053, 0.050)), ((0.80, 0.52, 0.14), (0.014, 0.014, 0.017))
+    tools = [
+        Instrument("grasper", (), (Material(c), Material(s)), JAW_MM, 0.0, 0.0, wrist=(0.62, 0.55)) for c, s in colors
+    ]
+    return tools[0], tools[1]
+
+
 _PAIRS = {
     "gray_blue": _gray_blue,
     "black": _black,
@@ -163,11 +182,13 @@ _PAIRS = {
 
 
 def instruments_of(family: str, seed: int) -> tuple[Instrument, Instrument]:
-    """The pair of one family of `PhantomConfig.instruments` but `graspers`.
+    """The pair of one family of `PhantomConfig.instruments`.
 
     Args:
         seed: of the shade, which differs a little between instruments, and of what is `mixed`.
     """
+    if family == "graspers":
+        return _graspers()
     rng = np.random.default_rng([seed, 9])
     if family == "mixed":
         first, second = rng.choice(list(_PAIRS), 2, replace=False)

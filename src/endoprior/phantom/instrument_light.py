@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """What instruments are made of: color, gloss, printed marks and wear of a surface, and the light it returns.
 
 A metal mirrors the tissue of the same image, blurred; plastic and paint do so only at grazing angles.
@@ -104,15 +105,10 @@ def _scuffed(x, around, phase, seed):
     return bare
 
 
-@njit(cache=True, fastmath=REORDERED)
-def paint_at(m, x, y, z, seed, n, out):
-    # Surface of material m (21,) at (x, y, z) mm in the shaft's axes. Writes out (7,): color, roughness, diffuse and
-    # mirrored shares, highlights; tilts the unit normal n (3,) by the unevenness.
+@njit(inline="always")
+def _grain(m, x, around, phase):
+    # About 1: how bright weave and stains make the surface.
     zero, one = np.float32(0), np.float32(1)
-    for c in range(3):
-        out[c] = m[c]
-    out[3], out[4], out[5], out[6] = m[_ROUGH], m[_DIFFUSE], m[_MIRROR], m[_SHINE]
-    around, phase = np.arctan2(z, y), np.float32(seed % 64)
     grain = one
     if m[_WEAVE] > zero:
         twist = np.float32(1.9) * np.sin(x * np.float32(0.9) + around * np.float32(5))
@@ -122,6 +118,19 @@ def paint_at(m, x, y, z, seed, n, out):
         fast = np.sin(x * np.float32(2.3) + around * np.float32(3))
         fast *= np.sin(x * np.float32(1.1) - around * np.float32(7))
         grain += m[_MOTTLE] * (np.float32(0.6) * slow + np.float32(0.4) * fast)
+    return grain
+
+
+@njit(cache=True, fastmath=REORDERED)
+def paint_at(m, x, y, z, seed, n, out):
+    # Surface of material m (21,) at (x, y, z) mm in the shaft's axes. Writes out (7,): color, roughness, diffuse and
+    # mirrored shares, highlights; tilts the unit normal n (3,) by the unevenness.
+    zero, one = np.float32(0), np.float32(1)
+    for c in range(3):
+        out[c] = m[c]
+    out[3], out[4], out[5], out[6] = m[_ROUGH], m[_DIFFUSE], m[_MIRROR], m[_SHINE]
+    around, phase = np.arctan2(z, y), np.float32(seed % 64)
+    grain = _grain(m, x, around, phase)
     if m[_RINGS + 3] > zero or m[_PRINT + 1] > zero:
         if _marked(m, x, around * np.sqrt(y * y + z * z), seed):
             for c in range(3):

@@ -84,7 +84,7 @@ def _share(slope: float) -> float:
 
 
 @njit(cache=True, fastmath=REORDERED)
-def _cylinder(along, radial, start, stop, radius, rounding):
+def cylinder(along, radial, start, stop, radius, rounding):
     # Signed distance to a cylinder between `start` and `stop` on its axis, with rounded rims.
     dx = radial - radius + rounding
     dy = abs(along - np.float32(0.5) * (start + stop)) - np.float32(0.5) * (stop - start) + rounding
@@ -101,7 +101,7 @@ def _tube(p, x, y, z):
     if p[14] > zero:
         wave = np.cos((x - p[3]) * np.float32(2 * pi) / p[15]) - np.float32(0.55)
         radial = radial + p[14] * max(zero, wave)
-    d = _cylinder(x, radial, p[3], p[4], wide, p[7])
+    d = cylinder(x, radial, p[3], p[4], wide, p[7])
     if p[8] > zero:
         d = max(d, p[8] - radial)
     if p[9] > zero:
@@ -142,14 +142,14 @@ def _rod(p, x, y, z):
 
 
 @njit(cache=True, fastmath=REORDERED)
-def _part_distance(p, x, y, z):
+def _one_distance(p, x, y, z):
     kind = p[0]
     if kind == np.float32(_TUBE):
         return _tube(p, x, y, z)
     if kind == np.float32(_BAR):
         return _bar(p, x, y, z)
     if kind == np.float32(_PIN):
-        return _cylinder(y, np.sqrt((x - p[3]) ** 2 + z * z), -p[5], p[5], p[4], np.float32(0.25))
+        return cylinder(y, np.sqrt((x - p[3]) ** 2 + z * z), -p[5], p[5], p[4], np.float32(0.25))
     return _rod(p, x, y, z)
 
 
@@ -174,13 +174,13 @@ def distance(px, py, pz, g, parts):
     for k in range(first, last):
         p = parts[k]
         if p[1] == np.float32(SHAFT):
-            d = _part_distance(p, x, y, z)
+            d = _one_distance(p, x, y, z)
         elif p[1] == np.float32(JAWS):
-            d = _part_distance(p, jx, jy, jz)
+            d = _one_distance(p, jx, jy, jz)
         elif p[1] == np.float32(UPPER):
-            d = _part_distance(p, c * jx + s * jz, jy, c * jz - s * jx)
+            d = _one_distance(p, c * jx + s * jz, jy, c * jz - s * jx)
         else:
-            d = _part_distance(p, c * jx - s * jz, jy, -c * jz - s * jx)
+            d = _one_distance(p, c * jx - s * jz, jy, -c * jz - s * jx)
         if d < near:
             near, index = d, k
     return near, index

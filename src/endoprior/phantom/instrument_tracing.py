@@ -1,7 +1,5 @@
-"""Sphere tracing of instruments that are tables of parts: their pose, and the color and depth of each sample.
-
-The pair of `graspers`, which is older, has a kernel of its own (`instrument.py`) that keeps its images bit-identical.
-"""
+# pyright: reportCallIssue=false
+"""Sphere tracing of instruments: their pose, and the color and depth of each sample."""
 
 from __future__ import annotations
 
@@ -13,7 +11,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
-from .eye import STILL, Eye
+from .camera import STILL, Eye
+from .graspers import draw_graspers
 from .instrument_light import Material, paint_at, radiance_at
 from .instrument_shapes import Part, distance
 from .motion import ToolPose
@@ -28,14 +27,13 @@ _MIRRORED_PX = 16
 
 @dataclass(frozen=True)
 class Instrument:
-    """One instrument as a table of parts."""
+    """One instrument."""
 
     name: str
     """What a surgeon calls it."""
     parts: tuple[Part, ...]
-    """Rows of `instrument_shapes`; the first `shaft_parts` are those that reach beyond `clear_mm`."""
+    """Rows of `instrument_shapes`; the first `shaft_parts` are those that reach beyond `clear_mm`. None: `graspers`."""
     materials: tuple[Material, ...]
-    """Parts name them by their index."""
     length_mm: float
     """From the wrist to the tip."""
     clear_mm: float
@@ -43,9 +41,8 @@ class Instrument:
     bound_mm: float
     """Radius of a cylinder around the shaft and all parts in its axes."""
     shaft_parts: int = 1
-    """How many parts make up the shaft."""
-    wrist: float = 0.0
-    """How much the wrist bends the jaws towards the line of sight; 0: a straight instrument."""
+    wrist: tuple[float, float] = (1.0, 0.0)
+    """Direction of the jaws: so much along the shaft, so much along the line of sight; the default is straight."""
     grip_mm: float = 2.0
     """Distance of the held tissue from the tip."""
     ball_mm: float = 0.0
@@ -64,14 +61,13 @@ def pack(pose: ToolPose, tool: Instrument, first: int, seed: int) -> NDArray[np.
     ball on the jaws' x and its radius, mm; a seed.
 
     Args:
-        first: row of its first part in the table of all parts.
+        first: row of its first part in the table of all parts; of its first material if it has no parts.
     """
-    direct = _unit(pose.tip - pose.pivot)
     view = _unit(pose.tip)
-    jaw = _unit(direct + tool.wrist * view)
+    jaw = _unit(tool.wrist[0] * _unit(pose.tip - pose.pivot) + tool.wrist[1] * view)
     wrist = pose.tip - (tool.length_mm - tool.grip_mm) * jaw
     back = _unit(pose.pivot - wrist)
-    hinge = _unit(-view + (view @ jaw) * jaw)
+    hinge = _unit(-view + (view @ jaw) * jaw)  # points roughly at the camera, so that the jaws are seen to open
     side = np.cross(hinge, jaw)
     c, s = np.cos(pose.roll + tool.roll), np.sin(pose.roll + tool.roll)
     hinge, side = c * hinge + s * side, c * side - s * hinge
@@ -134,6 +130,19 @@ def _mirrored(p, n, v, tissue_z, mirror, camera, focal, cx, cy, j, i, out):
         out[c] = lit * (top * (one - fy) + low * fy)
 
 
+@njit(inline="always")
+def _gradient(p, g, parts, n):
+    # Writes n (3,), along the gradient of the distance at p, from four corners of a small tetrahedron.
+    e = np.float32(0.03)
+    n[0] = n[1] = n[2] = np.float32(0)
+    for corner in range(4):
+        ex = e if corner == 0 or corner == 3 else -e
+        ey = e if corner >= 2 else -e
+        ez = e if corner == 1 or corner == 3 else -e
+        d = distance(p[0] + ex, p[1] + ey, p[2] + ez, g, parts)[0]
+        n[0], n[1], n[2] = n[0] + d * ex, n[1] + d * ey, n[2] + d * ez
+
+
 @njit(parallel=True, cache=True, fastmath=REORDERED)
 def _draw(tools, parts, materials, tissue_z, mirror, camera, lights, focal, cx, cy, color, depth):
     # A task takes every 64th row. Sphere-traces each tool (T, 31) in front of the tissue tissue_z (SH, SW), mm; writes
@@ -165,15 +174,7 @@ def _draw(tools, parts, materials, tissue_z, mirror, camera, lights, focal, cx, 
                 if not hit or t >= stop:
                     continue
                 p[0], p[1], p[2] = camera[0] + t * rx, camera[1] + t * ry, camera[2] + t * rz
-                # Gradient of the distance from four corners of a small tetrahedron.
-                e = np.float32(0.03)
-                n[0] = n[1] = n[2] = np.float32(0)
-                for corner in range(4):
-                    ex = e if corner == 0 or corner == 3 else -e
-                    ey = e if corner >= 2 else -e
-                    ez = e if corner == 1 or corner == 3 else -e
-                    d = distance(p[0] + ex, p[1] + ey, p[2] + ez, g, parts)[0]
-                    n[0], n[1], n[2] = n[0] + d * ex, n[1] + d * ey, n[2] + d * ez
+                _gradient(p, g, parts, n)
                 norm = one / max(np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), np.float32(1e-9))
                 n[0], n[1], n[2] = n[0] * norm, n[1] * norm, n[2] * norm
                 v[0], v[1], v[2] = -rx, -ry, -rz
@@ -201,7 +202,7 @@ def render_instruments(
     seed: int,
     tissue: NDArray[np.float32],
     tissue_z: NDArray[np.float32],
-    camera: NDArray[np.float32],
+    camera: NDArray[np.floating],
     focal: float,
     center: tuple[float, float],
     endoscope: Eye = STILL,
@@ -209,9 +210,7 @@ def render_instruments(
     """Render instruments in front of the tissue.
 
     Args:
-        poses: of each instrument, in world axes.
-        instruments: as many.
-        seed: of print, stains and wear.
+        poses: in world axes. instruments: as many, all with parts or all without. seed: of print, stains and wear.
         tissue: (SH, SW, 3) linear radiance of the tissue, which metals mirror. tissue_z: (SH, SW) its depth, mm.
         camera: (3,) camera center in the left camera's axes, mm.
         focal, center: of the sample grid, px.
@@ -221,18 +220,21 @@ def render_instruments(
     """
     parts, materials, tools = [], [], []
     for k, (pose, tool) in enumerate(zip(poses, instruments, strict=True)):
-        tools.append(pack(pose, tool, len(parts), seed + k))
+        tools.append(pack(pose, tool, len(parts) if tool.parts else len(materials), seed + k))
         parts += [(*part[:2], part[2] + len(materials), *part[3:]) for part in tool.parts]
         materials += [material.row() for material in tool.materials]
     packed = np.stack(tools)
     # A point and six directions, chosen in the world: a tool that is static stays so when the camera moves.
     packed[:, :3] = endoscope.sees(packed[:, :3])
     packed[:, 3:21] = (packed[:, 3:21].reshape(-1, 6, 3) @ endoscope.turn).reshape(-1, 18)
-    small = [max(2, round(size / _MIRRORED_PX)) for size in tissue_z.shape]
-    mirror = cv2.GaussianBlur(cv2.resize(tissue, small[::-1], interpolation=cv2.INTER_AREA), (0, 0), 0.7)
     color = np.zeros((*tissue_z.shape, 3), np.float32)
     depth = np.full(tissue_z.shape, FAR, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
-    tables = packed, np.array(parts, np.float32), np.stack(materials)
-    _draw(*tables, tissue_z, mirror, camera.astype(np.float32), LIGHTS_MM, f, cx, cy, color, depth)
+    view = camera.astype(np.float32), LIGHTS_MM, f, cx, cy
+    if not parts:
+        draw_graspers(packed, np.stack(materials), tissue_z, *view, color, depth)
+        return color, depth
+    small = [max(2, round(size / _MIRRORED_PX)) for size in tissue_z.shape]
+    mirror = cv2.GaussianBlur(cv2.resize(tissue, small[::-1], interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+    _draw(packed, np.array(parts, np.float32), np.stack(materials), tissue_z, mirror, *view, color, depth)
     return color, depth

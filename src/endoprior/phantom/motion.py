@@ -40,9 +40,8 @@ class Pull:
     vector: NDArray[np.float64]
     """(3,) displacement at the grasped point when fully pulled, along e_a, e_b, normal, mm."""
     start: float
-    """Phase at which this cycle of approach, pull and release begins."""
     length: float
-    """Its duration in phase."""
+    """Phase at which this cycle of approach, pull and release begins, and its duration."""
     width: float = 1.0
     """Factor of the size of the moved neighborhood."""
 

@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """Procedural noise on arbitrary coordinates: smooth fractal noise and cellular borders, both functions of a seed.
 
 Each output element depends only on its own coordinates, so results do not depend on the number of threads.
@@ -10,8 +11,6 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
-
-"""LLVM fast-math flags that keep NaN and infinity."""
 
 
 @njit(cache=True, inline="always")
@@ -45,10 +44,8 @@ def _fractal(x, y, octaves, seed, out):
                 sx = dx * dx * dx * (dx * (dx * np.float32(6) - np.float32(15)) + np.float32(10))
                 sy = dy * dy * dy * (dy * (dy * np.float32(6) - np.float32(15)) + np.float32(10))
                 n00, n10 = _corner(ix, iy, seed + k, dx, dy), _corner(ix + 1, iy, seed + k, dx - one, dy)
-                n01, n11 = (
-                    _corner(ix, iy + 1, seed + k, dx, dy - one),
-                    _corner(ix + 1, iy + 1, seed + k, dx - one, dy - one),
-                )
+                n01 = _corner(ix, iy + 1, seed + k, dx, dy - one)
+                n11 = _corner(ix + 1, iy + 1, seed + k, dx - one, dy - one)
                 top, bottom = n00 + sx * (n10 - n00), n01 + sx * (n11 - n01)
                 total += weight * (top + sy * (bottom - top))
                 weight *= np.float32(0.5)

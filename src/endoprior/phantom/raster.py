@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """Rasterize the deformed mesh: material coordinates and depth of each image sample.
 
 Letters: (MH, MW) mesh vertices, (SH, SW) image samples; sample (i, j) is centered at (j + 0.5, i + 0.5).
@@ -17,6 +18,32 @@ _NEAR_MM = 2.0
 """Vertices nearer than this, or behind the camera, are not drawn."""
 FAR = np.float32(1e9)
 """Depth of samples without a surface."""
+
+
+@njit(inline="always")
+def _fill(corners, indices, box, mesh_w, mesh_h, out):
+    # Draws one triangle where it is nearest. corners: x, y, then 1/z of each, 1 / area; indices: row, column of each.
+    half, one = np.float32(0.5), np.float32(1)
+    ax, ay, bx, by, cx, cy, wa, wb, wc, scale = corners
+    ia, ja, ib, jb, ic, jc = indices
+    left, right, first, last = box
+    for py in range(first, last + 1):
+        sy = np.float32(py) + half
+        for px in range(left, right + 1):
+            sx = np.float32(px) + half
+            la = ((bx - sx) * (cy - sy) - (by - sy) * (cx - sx)) * scale
+            lb = ((cx - sx) * (ay - sy) - (cy - sy) * (ax - sx)) * scale
+            lc = one - la - lb
+            if la < -_RIM or lb < -_RIM or lc < -_RIM:
+                continue
+            w = la * wa + lb * wb + lc * wc
+            z = one / w
+            if z < out[py, px, 2]:
+                u = (la * wa * np.float32(ja) + lb * wb * np.float32(jb) + lc * wc * np.float32(jc)) * z
+                v = (la * wa * np.float32(ia) + lb * wb * np.float32(ib) + lc * wc * np.float32(ic)) * z
+                out[py, px, 0] = u / np.float32(mesh_w - 1)
+                out[py, px, 1] = v / np.float32(mesh_h - 1)
+                out[py, px, 2] = z
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
@@ -51,24 +78,8 @@ def _rasterize(x, y, inverse_z, row_low, row_high, out):
                     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
                     if left > right or area == zero:
                         continue
-                    scale = one / area
-                    for py in range(first, last + 1):
-                        sy = np.float32(py) + half
-                        for px in range(left, right + 1):
-                            sx = np.float32(px) + half
-                            la = ((bx - sx) * (cy - sy) - (by - sy) * (cx - sx)) * scale
-                            lb = ((cx - sx) * (ay - sy) - (cy - sy) * (ax - sx)) * scale
-                            lc = one - la - lb
-                            if la < -_RIM or lb < -_RIM or lc < -_RIM:
-                                continue
-                            w = la * wa + lb * wb + lc * wc
-                            z = one / w
-                            if z < out[py, px, 2]:
-                                u = (la * wa * np.float32(ja) + lb * wb * np.float32(jb) + lc * wc * np.float32(jc)) * z
-                                v = (la * wa * np.float32(ia) + lb * wb * np.float32(ib) + lc * wc * np.float32(ic)) * z
-                                out[py, px, 0] = u / np.float32(mesh_w - 1)
-                                out[py, px, 1] = v / np.float32(mesh_h - 1)
-                                out[py, px, 2] = z
+                    corners = ax, ay, bx, by, cx, cy, wa, wb, wc, one / area
+                    _fill(corners, (ia, ja, ib, jb, ic, jc), (left, right, first, last), mesh_w, mesh_h, out)
 
 
 def rasterize(
@@ -78,7 +89,7 @@ def rasterize(
 
     Args:
         vertices: (MH, MW, 3) camera-space mesh, mm; what is behind the camera is left out.
-        focal, center: focal length and principal point, px of the sample grid.
+        focal, center: px of the sample grid.
     """
     z = vertices[..., 2]
     inverse_z = np.divide(1, z, out=np.zeros_like(z), where=z > _NEAR_MM)

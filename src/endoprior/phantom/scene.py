@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera_path import CameraPath
+from .camera import CameraPath, Eye, build_camera_path, widened
 from .config import PhantomConfig
-from .eye import Eye
+from .instrument_families import instruments_of
 from .instrument_tracing import Instrument
-from .motion import Motion, ToolPose
+from .motion import Motion, ToolPose, build_motion
 from .raster import vertex_normals
 from .smoke import Smoke
-from .surface import Plane
-from .tissue_looks import TissueLook
+from .surface import MARGIN, Plane, build_anatomy, build_plane, organs_at, soften
+from .texture import LOOKS, TissueLook, build_texture
+
+_TEXELS = 1.8
+"""Texels per pixel of the first image."""
+_FINER = 1.25
+"""A grid that is uniform on the tissue is as fine everywhere as one that is uniform in the image is at its lower edge,
+where the tissue is nearest."""
 
 
 @dataclass(frozen=True)
@@ -26,17 +32,14 @@ class Scene:
     plane: Plane
     motion: Motion
     a: NDArray[np.float64]
-    """(MH, MW) plane coordinates of the mesh vertices, mm."""
     b: NDArray[np.float64]
-    """(MH, MW) second plane coordinate, mm."""
     height: NDArray[np.float32]
-    """(MH, MW) rest height of the vertices, mm."""
+    """(MH, MW) each: plane coordinates and rest height of the mesh vertices, mm."""
     texture: NDArray[np.float32]
     """(TH, TW, 7) material maps."""
     path: CameraPath
     look: TissueLook
-    instruments: tuple[Instrument, Instrument] | None
-    """None: the pair of `graspers`."""
+    instruments: tuple[Instrument, Instrument]
     smoke: Smoke | None
 
     def vertices(self, phase: float) -> NDArray[np.float64]:
@@ -46,7 +49,12 @@ class Scene:
 
     def endoscope(self, phase: float) -> Eye:
         """Its left camera in the world at time `phase`."""
-        return Eye.posed(self.path.camera_to_world(phase))
+        pose = self.path.camera_to_world(phase)
+        return Eye(pose[:3, 3], pose[:3, :3])
+
+    def seen_vertices(self, phase: float) -> NDArray[np.float64]:
+        """(MH, MW, 3) mesh in the axes of the endoscope's left camera at time `phase`, mm."""
+        return self.endoscope(phase).sees(self.vertices(phase))
 
 
 @dataclass(frozen=True)
@@ -54,19 +62,56 @@ class Moment:
     """What moves, at one time, in the axes of the endoscope's left camera of that time."""
 
     endoscope: Eye
-    """The left camera in the world."""
     vertices: NDArray[np.float64]
-    """(MH, MW, 3) mesh, mm."""
     normals: NDArray[np.float32]
-    """(MH, MW, 3) its unit normals."""
+    """(MH, MW, 3) mesh, mm, and its unit normals."""
     tools: tuple[ToolPose, ToolPose]
     """In world axes."""
     phase: float = 0.0
-    """Time in [0, 1]."""
 
     @staticmethod
     def of(scene: Scene, phase: float) -> Moment:
         """The scene at time `phase` in [0, 1]."""
-        endoscope = scene.endoscope(phase)
-        vertices = endoscope.sees(scene.vertices(phase))
-        return Moment(endoscope, vertices, vertex_normals(vertices), scene.motion.tools(phase), phase)
+        vertices = scene.seen_vertices(phase)
+        return Moment(scene.endoscope(phase), vertices, vertex_normals(vertices), scene.motion.tools(phase), phase)
+
+
+def build_scene(cfg: PhantomConfig) -> Scene:
+    """Build anatomy, texture and motion of one seed."""
+    plane = build_plane(cfg)
+    path = build_camera_path(cfg, plane)
+    if path.excursions:
+        plane = widened(plane, path, cfg)
+    anatomy = build_anatomy(cfg.seed, plane.window if plane.metric else None)
+    (across, down), texels = grid_sizes(cfg, plane)
+    grid_v, grid_u = np.meshgrid(np.linspace(0, 1, down), np.linspace(0, 1, across), indexing="ij")
+    a, b = plane.coordinates(grid_u, grid_v)
+    spacing = float(np.diff(a[down // 2]).mean())
+    look = LOOKS[cfg.tissue]
+    height = soften(organs_at(anatomy, a, b).height, spacing, look.blurred_mm)
+    texture = build_texture(plane, anatomy, *texels, cfg.smooth_share, look)
+    motion = build_motion(cfg, plane, anatomy)
+    if look.blurred_mm > LOOKS["bowel"].blurred_mm:
+        # Pulls hold the mesh where smoothing has lowered it.
+        nearest = [np.argmin((a - pull.center[0]) ** 2 + (b - pull.center[1]) ** 2) for pull in motion.pulls]
+        lowered = [replace(p, height=float(height.flat[k])) for p, k in zip(motion.pulls, nearest, strict=True)]
+        motion = replace(motion, pulls=tuple(lowered))
+    tools = instruments_of(cfg.instruments, cfg.seed)
+    smoke = Smoke.of(cfg, look.smoke) if look.smoke > 0 else None
+    return Scene(cfg, plane, motion, a, b, height, texture, path, look, tools, smoke)
+
+
+def grid_sizes(cfg: PhantomConfig, plane: Plane) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Columns and rows of the mesh, and of the texture."""
+    # A vertex every two pixels, but enough for the shape of the loops.
+    vertices = min(max(cfg.width / 2, 160), 480)
+    if plane.metric:
+        x0, x1, y0, y1 = plane.window
+        wide = float(plane.origin[2]) * cfg.width / cfg.focal  # mm across the first image
+        mesh, texture = vertices / wide, _FINER * _TEXELS * cfg.width / wide
+        across, down = x1 - x0, y1 - y0
+        return (round(across * mesh) + 1, round(down * mesh) + 1), (round(across * texture), round(down * texture))
+    grown = 1 + 2 * MARGIN
+    columns = round(grown * vertices)
+    texels = round(grown * _TEXELS * cfg.width), round(grown * _TEXELS * cfg.height)
+    return (columns, round(columns * cfg.height / cfg.width)), texels

@@ -42,12 +42,7 @@ def develop(radiance: NDArray[np.float32], gain: float, shading: NDArray[np.floa
 
 
 def expose(display: NDArray[np.float32], noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) 8-bit image with sensor noise, which gamma amplifies in dark regions.
-
-    Args:
-        display: (H, W, 3) noise-free values in [0, 255].
-        noise: standard deviation at mid gray, in 8-bit levels.
-    """
+    """(H, W, 3) 8-bit image of `display` (H, W, 3), 0..255, with sensor noise: 8-bit levels at mid gray."""
     if noise > 0:
         grain = rng.standard_normal(display.shape, dtype=np.float32)
         # Partly correlated between channels, as after demosaicing; gamma amplifies the noise of dark pixels.
@@ -78,17 +73,17 @@ def stereo_depth(
     square = np.ones((3, 3), np.uint8)
     # Next to a depth edge (steeper than a slope of 4 per pixel) matching windows cover two surfaces.
     far_edge = z - cv2.erode(z, square) > 2 + 4 * z / cfg.focal
-    hidden = cv2.dilate(far_edge.astype(np.uint8), square) | _half_occluded(disparity)
-    glint = cv2.dilate((image.min(-1) >= 246).astype(np.uint8), square)
-    return np.where((hidden | glint) > 0, 0, measured).astype(np.float32)
+    spread = [cv2.dilate(where.astype(np.uint8), square) > 0 for where in (far_edge, image.min(-1) >= 246)]
+    missing = spread[0] | spread[1] | _half_occluded(disparity)
+    return np.where(missing, 0, measured).astype(np.float32)
 
 
-def _half_occluded(disparity: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(H, W) 1 where a nearer surface hides a pixel of `disparity` (H, W), px, from the right camera."""
+def _half_occluded(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W) True where a nearer surface hides a pixel of `disparity` (H, W), px, from the right camera."""
     column = np.arange(disparity.shape[1], dtype=np.float32)
     seen_at = column - disparity
     # Nearer surfaces shift further left: a pixel is hidden when one to its right lands at or left of its own place.
     ahead = np.minimum.accumulate(seen_at[:, ::-1], 1)[:, ::-1]
-    hidden = np.zeros(disparity.shape, np.uint8)
+    hidden = np.zeros(disparity.shape, bool)
     hidden[:, :-1] = ahead[:, 1:] < seen_at[:, :-1] - 0.5
     return hidden

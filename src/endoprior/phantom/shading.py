@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """Shading of wet tissue: two light guides next to the lens, inverse-square falloff, diffuse light, highlights.
 
 Wrapped diffuse lighting, stronger in red, approximates subsurface scattering. Highlights are GGX lobes with a normal
@@ -11,7 +12,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
-from .eye import Eye
+from .camera import Eye
+from .raster import FAR
 
 LIGHTS_MM = np.array([[-3.6, -2.2, 0.0], [3.9, -1.8, 0.0]], np.float32)
 """(2, 3) light guides in the left camera's axes, mm."""
@@ -94,9 +96,8 @@ def _shade(hits, normals, texture, e_a, e_b, camera, turn, viewer, lights, focal
                 norm = one / np.sqrt(hx * hx + hy * hy + hz * hz)
                 facing = max((bx * hx + by * hy + bz * hz) * norm, zero)
                 level = max((n[0] * hx + n[1] * hy + n[2] * hz) * norm, zero)
-                film = ggx(facing, np.float32(0.085)) * np.float32(0.0125) + ggx(facing, np.float32(0.26)) * np.float32(
-                    0.020
-                )
+                film = ggx(facing, np.float32(0.085)) * np.float32(0.0125)
+                film += ggx(facing, np.float32(0.26)) * np.float32(0.020)
                 sheen = ggx(level, np.float32(0.42)) * np.float32(0.012)
                 shine = (film * t[5] + sheen) * max(bent, zero) * open_
                 red += power * (t[0] * wrap_r * open_ + shine)
@@ -116,7 +117,6 @@ def shade(
     viewer: NDArray[np.float64],
     focal: float,
     center: tuple[float, float],
-    far: float,
 ) -> NDArray[np.float32]:
     """(SH, SW, 3) linear radiance of the tissue at every sample of `hits`.
 
@@ -125,15 +125,13 @@ def shade(
         normals: (MH, MW, 3) unit vertex normals.
         texture: (TH, TW, 7) material maps.
         axes: (2, 3) e_a and e_b of the tissue's plane in the axes of the left camera.
-        eye: the camera; the lights stay with the left one.
-        viewer: (3,) mm, where the light goes to: the center of `eye`, or of another camera.
+        eye: the camera; the lights stay with the left one. viewer: (3,) mm, where the light goes to.
         focal, center: of the sample grid, px.
-        far: the depth that marks nothing hit.
     """
     out = np.empty_like(hits)
     e_a, e_b = np.ascontiguousarray(axes, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
     center_mm, turn = eye.center.astype(np.float32), np.ascontiguousarray(eye.turn, np.float32)
     seen_from = viewer.astype(np.float32)
-    _shade(hits, normals, texture, e_a, e_b, center_mm, turn, seen_from, LIGHTS_MM, f, cx, cy, np.float32(far), out)
+    _shade(hits, normals, texture, e_a, e_b, center_mm, turn, seen_from, LIGHTS_MM, f, cx, cy, FAR, out)
     return out

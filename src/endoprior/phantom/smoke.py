@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .camera import Eye
 from .config import PhantomConfig
-from .eye import Eye
 from .motion import smooth_step
 from .noise import fractal
 
@@ -51,19 +51,12 @@ class Smoke:
         return float(self.peaks[k] * smooth_step(0.06, 0.35, local) * (1 - smooth_step(0.55, 0.97, local)))
 
     def veiled(
-        self,
-        radiance: NDArray[np.float32],
-        z: NDArray[np.float32],
-        phase: float,
-        eye: Eye,
-        focal: float,
-        center: tuple[float, float],
-    ) -> NDArray[np.float32]:
-        """(SH, SW, 3) linear radiance behind smoke.
+        self, radiance: NDArray, z: NDArray, phase: float, eye: Eye, focal: float, center: tuple[float, float]
+    ) -> NDArray:
+        """(SH, SW, 3) float32 linear radiance behind smoke, mixed with the light that the smoke scatters back.
 
         Args:
             radiance: (SH, SW, 3) without smoke. z: (SH, SW) depth of what is seen, mm.
-            phase: time in [0, 1].
             eye: the camera, in the axes of the endoscope's left one, with which the smoke moves.
             focal, center: of the sample grid, px.
         """
@@ -73,34 +66,21 @@ class Smoke:
         height, width = z.shape
         y, x = np.mgrid[:height:_COARSE, :width:_COARSE].astype(np.float32)
         x, y = (x - center[0]) / focal, (y - center[1]) / focal
-        seen = x * _VEIL_MM + eye.center[0], y * _VEIL_MM + eye.center[1]
-        return _blend(radiance, z, self._clouds(*seen, phase) * density, np.hypot(x, y), self.strongest)
+        clouds = self._clouds(x * _VEIL_MM + eye.center[0], y * _VEIL_MM + eye.center[1], phase) * density
+        # The light guides shine less away from the optical axis.
+        axis = (1 / (1 + np.hypot(x, y) ** 2) ** 2).astype(np.float32)
+        columns, rows = np.meshgrid(*(np.arange(size, dtype=np.float32) / _COARSE for size in (width, height)))
+        dense, lit = (
+            cv2.remap(coarse, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for coarse in (clouds, axis)
+        )
+        lost = 1 - np.exp(np.float32(np.log(1 - self.strongest) / _DEPTH_MM) * dense * z)
+        return radiance + lost[..., None] * (_COLOR * lit[..., None] - radiance)
 
-    def _clouds(self, x: NDArray, y: NDArray, phase: float) -> NDArray[np.float32]:
+    def _clouds(self, x: NDArray, y: NDArray, phase: float) -> NDArray:
         """In [0.12, 1.8]: relative density of the smoke at x, y, mm to the right and down."""
         time = phase * (self.frames - 1)
         # It rises and swirls; the slow field carries the fine one along.
         slow = fractal(x / 30 + 0.02 * time, y / 30 + 0.035 * time, 2, self.seed + 60)
         fine = fractal(x / 11 + 1.2 * slow - 0.03 * time, y / 11 + 0.08 * time, 3, self.seed + 61)
         return np.clip(0.8 + 1.5 * slow + 0.6 * fine, 0.12, 1.8).astype(np.float32)
-
-
-def _blend(
-    radiance: NDArray[np.float32], z: NDArray[np.float32], clouds: NDArray[np.float32], off: NDArray, strongest: float
-) -> NDArray[np.float32]:
-    """Mix radiance (SH, SW, 3) with the light that smoke scatters back.
-
-    Args:
-        clouds: (CH, CW) density. off: (CH, CW) tangent of the angle to the optical axis, away from which the light
-            guides shine less.
-    """
-    grid = (np.arange(z.shape[1], dtype=np.float32) / _COARSE, np.arange(z.shape[0], dtype=np.float32) / _COARSE)
-    dense, axis = _upsampled(clouds, *grid), _upsampled((1 / (1 + off**2) ** 2).astype(np.float32), *grid)
-    lost = 1 - np.exp(np.float32(np.log(1 - strongest) / _DEPTH_MM) * dense * z)
-    return radiance + lost[..., None] * (_COLOR * axis[..., None] - radiance)
-
-
-def _upsampled(coarse: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(SH, SW) linear interpolation of `coarse` (CH, CW) at columns x (SW,) and rows y (SH,)."""
-    columns, rows = np.meshgrid(x, y)
-    return cv2.remap(coarse, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

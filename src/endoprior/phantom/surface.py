@@ -74,25 +74,21 @@ class Anatomy:
     paths: NDArray[np.float32]
     """(K, M, 2) axes of the loops as polylines in (a, b), mm; loop 0 is the one the grasper takes."""
     radii: NDArray[np.float32]
-    """(K, M) radius along each loop, mm."""
     bases: NDArray[np.float32]
-    """(K, M) height of each loop's axis, mm; both ends dive under the neighbors."""
+    """(K, M) radius along each loop, and height of its axis, mm; both ends dive under the neighbors."""
     liver_edge: NDArray[np.float64]
     """(4,) level, slope, bend amplitude and phase of the liver's edge b(a)."""
 
 
 @dataclass(frozen=True)
 class Organs:
-    """Height and organ at each queried plane point."""
+    """Height above the plane, mm, and organ (a loop's index, FLOOR or LIVER) at each queried plane point."""
 
     height: NDArray[np.float32]
-    """mm above the plane."""
     owner: NDArray[np.int32]
-    """Loop index, FLOOR or LIVER."""
     along: NDArray[np.float32]
-    """Arc length along the loop, mm; 0 elsewhere."""
     across: NDArray[np.float32]
-    """Signed distance from the loop's axis, mm; 0 elsewhere."""
+    """Arc length along a loop, and signed distance from its axis, mm; 0 elsewhere."""
 
 
 def build_plane(cfg: PhantomConfig) -> Plane:
@@ -106,14 +102,14 @@ def build_plane(cfg: PhantomConfig) -> Plane:
     window = (-(cx + pad_x) / cfg.focal, (cfg.width + pad_x - cx) / cfg.focal)
     window += (-(cy + pad_y) / cfg.focal, (cfg.height + pad_y - cy) / cfg.focal)
     origin = np.array([0, 0, rng.uniform(78, 88)])
-    return Plane(origin, np.stack([e_a, np.cross(e_a, normal), normal]), window)
+    axes = np.stack([e_a, np.cross(e_a, normal), normal]).astype(np.float64)
+    return Plane(origin, axes, window)
 
 
 def build_anatomy(seed: int, wider: tuple[float, float, float, float] | None = None) -> Anatomy:
     """Choose the organs of one patient.
 
     Args:
-        seed: of the layout.
         wider: range (a0, a1, b0, b1), mm, to fill with further loops; those in the middle are the same without it.
     """
     rng = np.random.default_rng([seed, 2])
@@ -124,42 +120,51 @@ def build_anatomy(seed: int, wider: tuple[float, float, float, float] | None = N
     knots[:, 1] += sag * (knots[:, 0] / 40) ** 2
     knots[:, 1] *= rng.choice([-1.0, 1.0], p=[0.4, 0.6])
     roll = rng.uniform(-0.45, 0.35) * side
-    knots = knots @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
-    loops, radii, bases = [knots], [rng.uniform(11.0, 13.5)], [1.5]
-    # Each further loop is placed in the emptiest region, so that loops fill the whole image.
+    knots = knots @ np.array([[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]])
+    loops, sizes, heights = [knots], [rng.uniform(11.0, 13.5)], [1.5]
+    _add_loops(rng, 26, (-78, -62), (78, 62), loops, sizes, heights)
     steps = np.linspace(0, 1, _LOOP_POINTS)
-
-    def add_loops(count: int, low: tuple[float, float], high: tuple[float, float]) -> None:
-        for _ in range(count):
-            candidates = rng.uniform(low, high, (40, 2))
-            placed = np.concatenate(loops)
-            bare = np.linalg.norm(candidates[:, None] - placed, axis=-1).min(1)
-            center, angle, turn = candidates[bare.argmax()], rng.uniform(0, np.pi), rng.uniform(-1.3, 1.3)
-            reach = np.linspace(-1, 1, 6) * rng.uniform(18, 34)
-            heading = angle + turn * np.linspace(-1, 1, 6)
-            loops.append(center + reach[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1))
-            radii.append(rng.uniform(7.0, 11.5))
-            bases.append(rng.uniform(-5.5, 0.0))
-
-    def draw_waves(count: int) -> list[NDArray]:
-        return [1 + 0.05 * np.sin(2 * np.pi * (rng.uniform(3, 5) * steps + rng.uniform())) for _ in range(count)]
-
-    add_loops(26, (-78, -62), (78, 62))
-    waves = draw_waves(len(loops))
+    waves = _waves(rng, len(loops), steps)
     edge = np.array([rng.uniform(-33, -27), rng.uniform(-0.22, 0.22), rng.uniform(2, 5), rng.uniform(0, 6.3)])
     if wider is not None:
         # As many to a square mm as in the middle; under the liver there are none to be seen.
         a0, a1, b0, b1 = wider
         b0 = max(b0, edge[0] - 30)
         more = max(0, round((a1 - a0) * (b1 - b0) / _MM2_PER_LOOP) - len(loops))
-        add_loops(more, (a0, b0), (a1, b1))
-        waves += draw_waves(more)
+        _add_loops(rng, more, (a0, b0), (a1, b1), loops, sizes, heights)
+        waves += _waves(rng, more, steps)
     paths = np.stack([_spline(loop, _LOOP_POINTS) for loop in loops])
-    radii = np.array(radii)[:, None] * np.array(waves)
+    radii = np.array(sizes)[:, None] * np.array(waves)
     dive = np.clip(1 - np.minimum(steps, 1 - steps) / 0.24, 0, 1) ** 2
-    bases = np.array(bases)[:, None] - radii[:, :1] * 0.9 * dive
-    as_f32 = [np.ascontiguousarray(values, np.float32) for values in (paths, radii, bases)]
-    return Anatomy(seed, *as_f32, edge)
+    bases = np.array(heights)[:, None] - radii[:, :1] * 0.9 * dive
+    paths, radii, bases = (np.ascontiguousarray(values, np.float32) for values in (paths, radii, bases))
+    return Anatomy(seed, paths, radii, bases, edge)
+
+
+def _add_loops(
+    rng: np.random.Generator,
+    count: int,
+    low: tuple[float, float],
+    high: tuple[float, float],
+    loops: list[NDArray],
+    sizes: list[float],
+    heights: list[float],
+) -> None:
+    """Append knots, radius and height of loops, each in the emptiest place between `low` and `high` (a, b), mm."""
+    for _ in range(count):
+        candidates = rng.uniform(low, high, (40, 2))
+        bare = np.linalg.norm(candidates[:, None] - np.concatenate(loops), axis=-1).min(1)
+        center, angle, turn = candidates[bare.argmax()], rng.uniform(0, np.pi), rng.uniform(-1.3, 1.3)
+        reach = np.linspace(-1, 1, 6) * rng.uniform(18, 34)
+        heading = angle + turn * np.linspace(-1, 1, 6)
+        loops.append(center + reach[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1))
+        sizes.append(rng.uniform(7.0, 11.5))
+        heights.append(rng.uniform(-5.5, 0.0))
+
+
+def _waves(rng: np.random.Generator, count: int, steps: NDArray) -> list[NDArray]:
+    """How the radius of each of `count` loops varies along it, about 1."""
+    return [1 + 0.05 * np.sin(2 * np.pi * (rng.uniform(3, 5) * steps + rng.uniform())) for _ in range(count)]
 
 
 def _spline(knots: NDArray, count: int) -> NDArray:
@@ -168,7 +173,7 @@ def _spline(knots: NDArray, count: int) -> NDArray:
     t = np.linspace(0, len(knots) - 3 - 1e-9, 8 * count)
     k, f = t.astype(int), (t % 1)[:, None]
     weights = ((1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3)
-    curve = sum(w * knots[k + i] for i, w in enumerate(weights)) / 6
+    curve = np.sum([w * knots[k + i] for i, w in enumerate(weights)], 0) / 6
     arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     even = np.linspace(0, arc[-1], count)
     return np.stack([np.interp(even, arc, curve[:, i]) for i in range(2)], -1)
@@ -249,6 +254,6 @@ def _liver_height(anatomy: Anatomy, a: NDArray, b: NDArray) -> NDArray[np.float3
     return (4.5 + 7.5 * lip + 0.05 * np.maximum(inside - 9, 0) + skirt).astype(np.float32)
 
 
-def soften(height: NDArray[np.float32], spacing_mm: float, radius_mm: float) -> NDArray[np.float32]:
-    """Gaussian blur of a height map whose samples lie about `spacing_mm` apart; sigma = `radius_mm`."""
-    return cv2.GaussianBlur(height, (0, 0), max(radius_mm / spacing_mm, 0.3), borderType=cv2.BORDER_REPLICATE)
+def soften(values: NDArray, spacing_mm: float, radius_mm: float) -> NDArray:
+    """Gaussian blur of a map whose samples lie about `spacing_mm` apart; sigma = `radius_mm`."""
+    return cv2.GaussianBlur(values, (0, 0), max(radius_mm / spacing_mm, 0.3), borderType=cv2.BORDER_REPLICATE)

@@ -1,20 +1,20 @@
-"""Material maps of the tissue: color, fine relief, wetness and ambient occlusion.
+"""Kinds of tissue, and their material maps: color, fine relief, wetness and ambient occlusion.
 
-Letters: (TH, TW) texels; texel (i, j) is at g_u = (j + 0.5) / TW, g_v = (i + 0.5) / TH.
+The shapes of all kinds are those of `bowel`, but a liver has no narrow folds. Colors of kinds are display values in
+[0, 1]. Letters: (TH, TW) texels; texel (i, j) is at g_u = (j + 0.5) / TW, g_v = (i + 0.5) / TH.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .blood import bled, blood_depth
 from .noise import cells, fractal
 from .surface import FLOOR, LIVER, Anatomy, Organs, Plane, organs_at, soften
-from .tissue_looks import LOOKS, TissueLook
 from .vessels import vessel_maps
 
 CHANNELS = 7
@@ -24,9 +24,91 @@ SMOOTHED = 0.92
 """Share of the color detail and of the fine relief that a smooth patch lacks."""
 PATCH_BLUR_MM = 6.0
 """Color detail smaller than this is taken out of smooth patches."""
+_INK = np.array([0.125, 0.0045, 0.0035], np.float32)
+"""Linear color of deep blood."""
+_POOLED = 0.72
+"""Share of the blood that lies in pools; the rest is in streaks."""
 
 
-def _linear(display: tuple[float, float, float]) -> NDArray[np.float32]:
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TissueLook:
+    """How one kind of tissue looks; the defaults are `bowel`."""
+
+    loops: tuple[Color, Color, Color] = ((0.74, 0.40, 0.38), (0.86, 0.60, 0.53), (0.56, 0.25, 0.31))
+    """A loop's color, and the pale and the dusky one between which it varies."""
+    ground: tuple[Color, Color, Color] = ((0.74, 0.46, 0.45), (0.88, 0.70, 0.46), (0.40, 0.16, 0.14))
+    """Colors of the mesentery between the loops, of fat and of the liver."""
+    vessels: tuple[Color, Color] = ((0.56, 0.13, 0.14), (0.38, 0.10, 0.16))
+    """Colors of thin and thick vessels."""
+    opacity: tuple[float, float] = (0.62, 0.80)
+    """Opacity of thin and thick vessels, 0..1."""
+    cover: Literal["serosa", "fat", "liver"] = "serosa"
+    """What the loops are covered with: their texture and relief."""
+    creases: float = 1.0
+    """Factor of the depth of fine creases, and of the contrast of the liver's lobules."""
+    wet: float = 1.0
+    """Factor of the highlights of the wet film."""
+    blurred_mm: float = 0.7
+    """Radius within which shapes are smoothed, mm; at least 0.7."""
+    blood: float = 0.0
+    """Share of the tissue under blood, 0..1."""
+    smoke: float = 0.0
+    """Share of the light that the densest smoke takes away at 80 mm, 0..1."""
+    light: Color = (1.0, 1.0, 1.0)
+    """Color of the light, linear."""
+    exposure: float = 1.0
+    """Brightness of the image beside that of `bowel`."""
+
+
+_BOWEL = TissueLook()
+LOOKS = {
+    "bowel": _BOWEL,
+    "pale": TissueLook(
+        loops=((0.86, 0.70, 0.63), (0.93, 0.84, 0.77), (0.80, 0.58, 0.55)),
+        ground=((0.88, 0.74, 0.66), (0.93, 0.84, 0.66), (0.52, 0.30, 0.25)),
+        vessels=((0.74, 0.40, 0.38), (0.55, 0.32, 0.40)),
+        opacity=(0.40, 0.55),
+        creases=0.7,
+        wet=0.8,
+        exposure=1.15,
+    ),
+    "fat": TissueLook(
+        loops=((0.90, 0.73, 0.40), (0.94, 0.83, 0.56), (0.84, 0.59, 0.32)),
+        ground=((0.86, 0.63, 0.40), (0.92, 0.78, 0.44), _BOWEL.ground[2]),
+        vessels=((0.72, 0.30, 0.16), (0.52, 0.15, 0.13)),
+        opacity=(0.50, 0.70),
+        cover="fat",
+        wet=1.25,
+    ),
+    "purple": TissueLook(
+        loops=((0.42, 0.23, 0.29), (0.55, 0.33, 0.36), (0.27, 0.14, 0.22)),
+        ground=((0.46, 0.27, 0.31), (0.62, 0.46, 0.36), (0.32, 0.14, 0.14)),
+        vessels=((0.27, 0.09, 0.14), (0.16, 0.07, 0.14)),
+        opacity=(0.70, 0.88),
+        creases=0.75,
+        wet=1.2,
+        exposure=0.50,
+    ),
+    "liver": TissueLook(
+        loops=((0.42, 0.22, 0.16), *_BOWEL.loops[1:]),
+        ground=((0.42, 0.23, 0.17), _BOWEL.ground[1], (0.42, 0.22, 0.16)),
+        cover="liver",
+        creases=0.5,
+        wet=1.1,
+        blurred_mm=4.0,
+        exposure=0.55,
+    ),
+    "warm": replace(_BOWEL, light=(1.12, 0.80, 0.46)),
+    "smoke": replace(_BOWEL, smoke=0.66),
+    "blood": replace(_BOWEL, blood=0.38, exposure=0.92),
+}
+"""By the values of `PhantomConfig.tissue`."""
+
+
+def _linear(display: tuple[float, float, float]) -> NDArray:
     """(3,) linear light of a display color in [0, 1]."""
     return np.array(display, np.float32) ** np.float32(2.2)
 
@@ -37,14 +119,14 @@ def _step(low: float, high: float, x: NDArray) -> NDArray:
     return t * t * (3 - 2 * t)
 
 
-def smooth_patches(a: NDArray, b: NDArray, seed: int, share: float) -> NDArray[np.float32]:
+def smooth_patches(a: NDArray, b: NDArray, seed: int, share: float) -> NDArray:
     """In [0, 1]: how little texture the tissue has at plane points `a, b`, mm; above 0.5 on `share` of the tissue."""
     rows, columns = np.mgrid[-60:60:1.0, -70:70:1.0].astype(np.float32)
     level = float(np.quantile(_patch_noise(columns, rows, seed), 1 - share))
     return _step(level - 0.12, level + 0.12, _patch_noise(a, b, seed)).astype(np.float32)
 
 
-def _patch_noise(a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:
+def _patch_noise(a: NDArray, b: NDArray, seed: int) -> NDArray:
     return fractal(a.astype(np.float32) / 19, b.astype(np.float32) / 19, 1, seed + 130)
 
 
@@ -55,7 +137,7 @@ def build_texture(
     height: int,
     smooth_share: float = 0.0,
     look: TissueLook = LOOKS["bowel"],
-) -> NDArray[np.float32]:
+) -> NDArray:
     """(TH, TW, CHANNELS) material maps for a grid of `height` x `width` texels."""
     grid_v, grid_u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
     a, b = plane.coordinates(grid_u, grid_v)
@@ -80,7 +162,7 @@ def build_texture(
         relief = relief * (1 - SMOOTHED * patches)
     wet = look.wet * np.clip(0.75 + 0.7 * fractal(a / 9, b / 9, 2, seed + 1), 0.25, 1)
     if look.blood > 0:
-        albedo, relief, wet = bled(albedo, relief, wet, blood_depth(organs, a, b, mm_per_texel, seed, look.blood))
+        albedo, relief, wet = bled(albedo, relief, wet, _blood_depth(organs, a, b, mm_per_texel, seed, look.blood))
     smooth = soften(relief.astype(np.float32), mm_per_texel, 0.09)
     texture = np.zeros((height, width, CHANNELS), np.float32)
     texture[..., :3] = albedo
@@ -92,15 +174,19 @@ def build_texture(
     return texture
 
 
-def _blurred(albedo: NDArray[np.float32], mm_per_texel: float) -> NDArray[np.float32]:
+def _coarse(values: NDArray, mm_per_texel: float) -> tuple[NDArray, float]:
+    """A map at about half a mm per texel, and how many mm that is."""
+    step = max(1, round(0.5 / mm_per_texel))
+    return cv2.resize(values, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA), mm_per_texel * step
+
+
+def _blurred(albedo: NDArray, mm_per_texel: float) -> NDArray:
     """(TH, TW, 3) color without detail smaller than `PATCH_BLUR_MM`."""
-    coarse = max(1, round(0.5 / mm_per_texel))
-    small = cv2.resize(albedo, None, fx=1 / coarse, fy=1 / coarse, interpolation=cv2.INTER_AREA)
-    small = soften(small, mm_per_texel * coarse, PATCH_BLUR_MM)
+    small = soften(*_coarse(albedo, mm_per_texel), PATCH_BLUR_MM)
     return cv2.resize(small, albedo.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def _wrinkles(organs: Organs, a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:
+def _wrinkles(organs: Organs, a: NDArray, b: NDArray, seed: int) -> NDArray:
     """Fine creases in [-1, 1]: across the axis on loops, in every direction elsewhere."""
     offset = 37.0 * organs.owner
     along = organs.along + 0.8 * fractal(a / 4, b / 4, 2, seed + 2)
@@ -111,7 +197,7 @@ def _wrinkles(organs: Organs, a: NDArray, b: NDArray, seed: int) -> NDArray[np.f
 
 def _relief(
     look: TissueLook, organs: Organs, a: NDArray, b: NDArray, wrinkles: NDArray, trunks: NDArray, seed: int
-) -> NDArray[np.float32]:
+) -> NDArray:
     """Fine height in mm that bends normals only: creases, grain, raised vessels, liver lobules."""
     strength = 0.55 + 0.9 * np.clip(fractal(a / 13, b / 13, 2, seed + 6) + 0.35, 0, 1)
     grain = fractal(a / 0.62, b / 0.62, 2, seed + 7)
@@ -125,7 +211,7 @@ def _relief(
     return np.where(organs.owner == LIVER, lobules, serosa).astype(np.float32)
 
 
-def _lumps(a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:
+def _lumps(a: NDArray, b: NDArray, seed: int) -> NDArray:
     """In [0, 1]: 0 in the seams between lumps of fat about 4 mm wide, 1 inside them."""
     bent = 1.2 * fractal(a / 5, b / 5, 2, seed + 30)
     return _step(-0.1, 0.8, cells((a + bent) / 4.2, (b - bent) / 4.2, seed + 31)).astype(np.float32)
@@ -143,22 +229,23 @@ def _albedo(
     seed: int,
     rng: np.random.Generator,
     loops: int,
-) -> NDArray[np.float32]:
+) -> NDArray:
     """(TH, TW, 3) linear color in [0, 1]."""
     mottle = fractal(a / 6, b / 6, 4, seed + 20)
     fine = fractal(a / 1.1, b / 1.1, 3, seed + 21)
-    loop, pale, dusky = _linear(look.loop), _linear(look.loop_pale), _linear(look.loop_dusky)
+    loop, pale, dusky = map(_linear, look.loops)
+    mesentery, fat, liver_color = map(_linear, look.ground)
     # Each loop has its own complexion between dusky and pale.
     complexion = np.concatenate([rng.uniform(-0.45, 0.35, max(64, loops)), [0, 0]]).astype(np.float32)[organs.owner]
     tone = np.clip(complexion - 0.12 + 0.95 * mottle, -1, 1)[..., None]
     color = loop + np.maximum(tone, 0) * (pale - loop) + np.maximum(-tone, 0) * (dusky - loop)
     fat_amount = _step(0.02, 0.34, fractal(a / 10, b / 10, 3, seed + 22)) * 0.85
-    floor = _linear(look.floor) + fat_amount[..., None] * (_linear(look.fat) - _linear(look.floor))
+    floor = mesentery + fat_amount[..., None] * (fat - mesentery)
     floor = floor * (1 + 0.25 * mottle[..., None])
     lobule = _step(0.0, 0.32, cells(a / 1.25, b / 1.25, seed + 9))
     if look.creases < 1:
         lobule = 1 - look.creases * (1 - lobule)
-    liver = _linear(look.liver) * (0.72 + 0.38 * lobule + 0.35 * mottle)[..., None]
+    liver = liver_color * (0.72 + 0.38 * lobule + 0.35 * mottle)[..., None]
     color = np.where((organs.owner == FLOOR)[..., None], floor, color)
     serosa = 1 + (1 - 0.75 * plain) * (0.26 * fine + 0.38 * wrinkles)
     color = color * serosa[..., None] + (0.25 * plain)[..., None] * (pale - color)
@@ -166,19 +253,44 @@ def _albedo(
     if look.cover == "fat":
         seams = 1 - _lumps(a, b, seed)
         color = color + (0.55 * seams)[..., None] * (dusky - color)
-    for map_, ink, opacity in ((twigs, look.twig, look.vessels[0]), (trunks, look.trunk, look.vessels[1])):
+    for map_, ink, opacity in zip((twigs, trunks), look.vessels, look.opacity, strict=True):
         color = color + (opacity * shown * map_)[..., None] * (_linear(ink) - color)
     color = np.where((organs.owner == LIVER)[..., None], liver, color)
     return np.clip(color, 0.004, 1).astype(np.float32)
 
 
-def _openness(height: NDArray[np.float32], mm_per_texel: float) -> NDArray[np.float32]:
+def _openness(height: NDArray, mm_per_texel: float) -> NDArray:
     """In (0, 1]: how much of the light reaches a point; small in the creases between organs."""
-    coarse = max(1, round(0.5 / mm_per_texel))
-    small = cv2.resize(height, None, fx=1 / coarse, fy=1 / coarse, interpolation=cv2.INTER_AREA)
-    buried = sum(
-        weight * np.maximum(soften(small, mm_per_texel * coarse, radius) - small, 0)
-        for radius, weight in ((1.5, 0.55), (4.0, 0.25), (9.0, 0.10))
+    small, spacing = _coarse(height, mm_per_texel)
+    near, middle, far = (np.maximum(soften(small, spacing, radius) - small, 0) for radius in (1.5, 4.0, 9.0))
+    buried = 0.55 * near + 0.25 * middle + 0.10 * far
+    return cv2.resize(np.exp(-buried).astype(np.float32), height.shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def _blood_depth(organs: Organs, a: NDArray, b: NDArray, mm_per_texel: float, seed: int, share: float) -> NDArray:
+    """(TH, TW) in [0, 1]: how deep the blood is; above 0 on about `share` of the tissue."""
+    sunken = soften(organs.height, mm_per_texel, 5.0) - organs.height
+    pools = fractal(a / 13, b / 13, 3, seed + 40) + 0.16 * np.clip(sunken, -3, 4)
+    # Streaks run down the image, winding.
+    aside = a + 4 * fractal(a / 15, b / 15, 2, seed + 41)
+    streaks = fractal(aside / 3.2, b / 26, 2, seed + 42) + 0.5 * fractal(a / 22, b / 22, 1, seed + 43)
+
+    def above(field: NDArray, part: float, width: float) -> NDArray:
+        # 0 below the level that `part` of the field exceeds, rising to 1 within `width` above it.
+        return np.clip((field - np.quantile(field[::4, ::4], 1 - part)) / width, 0, 1)
+
+    return np.maximum(above(pools, _POOLED * share, 0.34), 0.6 * above(streaks, (1 - _POOLED) * share, 0.30)).astype(
+        np.float32
     )
-    small_openness = np.exp(-buried).astype(np.float32)
-    return cv2.resize(small_openness, height.shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def bled(albedo: NDArray, relief: NDArray, wet: NDArray, depth: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Linear color (TH, TW, 3), fine height (TH, TW), mm, and wetness (TH, TW) under blood of `depth` (TH, TW)."""
+    covered = np.minimum(3 * depth, 1)
+    # A film stains what is below it; depth hides it.
+    stained = albedo * np.array([0.80, 0.22, 0.20], np.float32)
+    color = albedo + covered[..., None] * (stained - albedo)
+    color = color + (1 - np.exp(-3.5 * depth))[..., None] * (_INK - color)
+    # The surface is smooth, and rises from its rim.
+    smooth = relief * (1 - 0.85 * covered) + 0.35 * np.sqrt(depth)
+    return color.astype(np.float32), smooth, wet + covered * (1.35 - wet)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,8 +18,7 @@ _STEP_MM = 0.7
 _SUBPIXEL_BITS = 4
 
 
-@dataclass(frozen=True)
-class _Branch:
+class _Branch(NamedTuple):
     """One vessel to be grown: start (a, b) mm, heading rad, caliber and length mm."""
 
     start: NDArray[np.float64]
@@ -30,20 +29,18 @@ class _Branch:
 
 def vessel_maps(
     plane: Plane, a: NDArray, b: NDArray, organs: Organs, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray, NDArray]:
     """Grow trees from random points; each stays on its own organ and splits into thinner branches.
 
-    Args:
-        plane, a, b, organs: the material grid (TH, TW) to draw on, and what lies there.
     Returns:
-        two (TH, TW) maps in [0, 1]: trunks (caliber above 0.3 mm) and twigs.
+        two float32 maps in [0, 1] on the material grid a, b (TH, TW): trunks (caliber above 0.3 mm) and twigs.
     """
     shape = a.shape
     mm_per_texel = float(np.abs(np.diff(a[shape[0] // 2])).mean())
     trunks, twigs = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     low, high = np.array([a.min(), b.min()]), np.array([a.max(), b.max()])
-    pending = []
     trees = round(TREES * np.prod(high - low) / _TISSUE_MM2) if plane.metric else TREES
+    pending = []
     for _ in range(trees):
         start, heading = rng.uniform(low, high), rng.uniform(0, 2 * np.pi)
         caliber = 0.16 + 0.34 * rng.uniform() ** 4
@@ -52,8 +49,6 @@ def vessel_maps(
         branch = pending.pop()
         points, children = _grow(branch, plane, organs, rng)
         pending.extend(children)
-        if len(points) < 2:
-            continue
         texels = np.stack(plane.grid(points[:, 0], points[:, 1]), -1) * [shape[1], shape[0]] - 0.5
         fixed = np.round(texels * 2**_SUBPIXEL_BITS).astype(np.int32).reshape(-1, 1, 2)
         target = trunks if branch.caliber > 0.3 else twigs
@@ -65,9 +60,12 @@ def vessel_maps(
             strength = int(255 * min(1.0, width) * (0.55 + 0.45 * min(1.0, caliber / 0.35)))
             piece = fixed[k : k + 5]
             cv2.polylines(target, [piece], False, strength, max(1, round(width)), cv2.LINE_AA, _SUBPIXEL_BITS)
-    depth_blur = (0.11 / mm_per_texel, 0.06 / mm_per_texel)  # vessels lie under the serosa, trunks deeper than twigs
-    blurred = [cv2.GaussianBlur(m, (0, 0), max(s, 0.4)) for m, s in zip((trunks, twigs), depth_blur, strict=True)]
-    return blurred[0].astype(np.float32) / 255, blurred[1].astype(np.float32) / 255
+    # Vessels lie under the serosa, trunks deeper than twigs.
+    blurred = (
+        cv2.GaussianBlur(drawn, (0, 0), max(depth_mm / mm_per_texel, 0.4)).astype(np.float32) / 255
+        for drawn, depth_mm in ((trunks, 0.11), (twigs, 0.06))
+    )
+    return next(blurred), next(blurred)
 
 
 def _grow(branch: _Branch, plane: Plane, organs: Organs, rng: np.random.Generator) -> tuple[NDArray, list[_Branch]]:
@@ -76,24 +74,20 @@ def _grow(branch: _Branch, plane: Plane, organs: Organs, rng: np.random.Generato
     # A slow oscillation gives the winding course, white noise the small kinks.
     turns = rng.normal(0, 0.16, count) + 0.16 * np.sin(np.arange(count) * rng.uniform(0.2, 0.5) + rng.uniform(0, 6.3))
     headings = branch.heading + np.cumsum(turns)
-    steps = _STEP_MM * np.stack([np.cos(headings), np.sin(headings)], -1)
-    points = branch.start + np.cumsum(steps, 0)
+    points = branch.start + np.cumsum(_STEP_MM * np.stack([np.cos(headings), np.sin(headings)], -1), 0)
     grid_u, grid_v = plane.grid(points[:, 0], points[:, 1])
     height, width = organs.owner.shape
-    inside = (grid_u >= 0) & (grid_u < 1) & (grid_v >= 0) & (grid_v < 1)
     row = np.clip((grid_v * height).astype(int), 0, height - 1)
     column = np.clip((grid_u * width).astype(int), 0, width - 1)
     owner = organs.owner[row, column]
+    inside = (grid_u >= 0) & (grid_u < 1) & (grid_v >= 0) & (grid_v < 1)
     stays = inside & (owner == owner[0]) & (owner != LIVER)
     length = count if stays.all() else int(stays.argmin())
     children = []
     if branch.caliber > 0.10:
         for k in np.flatnonzero(rng.uniform(size=length) < 0.17):
-            side = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.1)
-            thinner = branch.caliber * rng.uniform(0.5, 0.72)
-            children.append(
-                _Branch(
-                    points[k], headings[k] + side, thinner, (branch.length - k * _STEP_MM) * rng.uniform(0.5, 0.8) + 1
-                )
-            )
+            heading = headings[k] + rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.1)
+            caliber = branch.caliber * rng.uniform(0.5, 0.72)
+            left = (branch.length - k * _STEP_MM) * rng.uniform(0.5, 0.8) + 1
+            children.append(_Branch(points[k], heading, caliber, left))
     return points[:length], children

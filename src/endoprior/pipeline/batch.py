@@ -18,27 +18,24 @@ from ..evaluation.registry import all_scores
 from ..prepare.pipeline import Progress
 from ..render import ON_GPU
 from ..runs.remote import RESTARTS, Training, start_training_on, trainings
-from ..runs.training_run import WindowedRun
+from ..runs.train import WindowedRun
 from ..system.atomic import write_text
 from ..system.devices import Threads
 from ..system.ray_cluster import Cluster
 from .job import SequenceJob, open_folder
 from .steps import SHOWN_SCORES, run_step, start_training, steps_of
 
-FAILURE = "failure.txt"
-"""In the folder of a job: the traceback, if it failed by an error of the program."""
+FAILURE = "failure.txt"  # in the folder of a job: the traceback, if it failed by an error of the program
 SUMMARY, TABLE = "summary.md", "scores.csv"
 """Files in the folder of a batch: the main scores to read, and all scores as numbers."""
-BEGIN, FINISH = "before training", "after training"
-"""Calls of a job on a cluster; between them are those that train."""
+BEGIN, FINISH = "before training", "after training"  # calls of a job on a cluster; between them are those that train
 
 
 @dataclass(frozen=True)
 class Entry:
     """A job of a list."""
 
-    name: str
-    """Of its folder."""
+    name: str  # of its folder
     job: SequenceJob
 
     @property
@@ -52,8 +49,7 @@ class Outcome:
     """How a job ended."""
 
     entry: Entry
-    failure: str = ""
-    """Why it failed, one line; empty if it is done."""
+    failure: str = ""  # why it failed, one line; empty if it is done
 
 
 @dataclass(frozen=True)
@@ -70,11 +66,7 @@ class Call:
 def run_here(
     entries: Sequence[Entry], shown: Callable[[Entry, str], AbstractContextManager[Progress]]
 ) -> Iterator[Outcome]:
-    """Do all jobs in this process, in order, and yield how each ended.
-
-    Args:
-        shown: shows the progress of a step by its name.
-    """
+    """Do all jobs in this process, in order, and yield how each ended. Args: shown: shows the progress of a step."""
     for entry in entries:
         try:
             _open(entry)
@@ -98,29 +90,23 @@ def run_on(cluster: Cluster, entries: Sequence[Entry], say: Callable[[str], None
         cluster.start(Call(entry, what), function, entry.job, mine, cores=cores, on_gpu=on_gpu, restarts=RESTARTS)
 
     for entry in entries:
-        try:
-            _open(entry)
-        except InputError as error:
-            yield Outcome(entry, _reason(entry, error))
-            continue
-        if entry.is_done:
-            yield Outcome(entry)
+        if outcome := _opened(entry):
+            yield outcome
         else:
             start(entry, BEGIN, begin, cluster.cores_for(len(entries)))
     while cluster.num_running:
         ended = cluster.next()
         entry, what = ended.key.entry, ended.key.what
-        left[entry.name] -= 1
+        trainings_left = ended.value if what == BEGIN and ended.error is None else []
+        cores = cluster.cores_for(max(cluster.num_running + len(trainings_left), 1))
+        left[entry.name] += len(trainings_left) - 1
         if ended.error is not None:
             failures.setdefault(entry.name, _reason(entry, ended.error))
-        elif what == BEGIN:
-            say(f"{entry.name}: checked; left to train: {len(ended.value)}")
-            cores = cluster.cores_for(cluster.num_running + len(ended.value))
-            for training in ended.value:
-                left[entry.name] += 1
-                start_training_on(cluster, Call(entry, training.name), training, cores)
         elif what != FINISH:
-            say(f"{ended.key}: {ended.value}")
+            checked = f"{entry.name}: checked; left to train: {len(trainings_left)}"
+            say(checked if what == BEGIN else f"{ended.key}: {ended.value}")
+        for training in trainings_left:
+            start_training_on(cluster, Call(entry, training.name), training, cores)
         if left[entry.name]:
             continue
         if entry.name in failures or what == FINISH:
@@ -129,12 +115,17 @@ def run_on(cluster: Cluster, entries: Sequence[Entry], say: Callable[[str], None
             start(entry, FINISH, finish, cluster.cores_for(cluster.num_running + 1))
 
 
-def begin(job: SequenceJob, threads: Threads) -> list[Training]:
-    """Do the steps of a job before its training, in this process.
+def _opened(entry: Entry) -> Outcome | None:
+    """How a job ended that cannot begin, or is done."""
+    try:
+        _open(entry)
+    except InputError as error:
+        return Outcome(entry, _reason(entry, error))
+    return Outcome(entry) if entry.is_done else None
 
-    Returns:
-        What is left to train.
-    """
+
+def begin(job: SequenceJob, threads: Threads) -> list[Training]:
+    """Do the steps of a job before its training, in this process; what is left to train."""
     threads.use()
     for step in steps_of(job):
         if step.name == "train":
@@ -156,7 +147,7 @@ def finish(job: SequenceJob, threads: Threads) -> None:
         run_step(step, job, _quiet)
 
 
-def _quiet(what: str, done: int, total: int) -> None:
+def _quiet(_what: str, _done: int, _total: int) -> None:
     """No progress."""
 
 
@@ -176,11 +167,7 @@ def _reason(entry: Entry, error: Exception) -> str:
 
 
 def write_summary(outcomes: Sequence[Outcome], out: Path) -> list[str]:
-    """Write the table of a batch to `SUMMARY` and `TABLE` in `out`.
-
-    Returns:
-        The lines of `SUMMARY`.
-    """
+    """Write the table of a batch to `SUMMARY` and `TABLE` in `out`; the lines of `SUMMARY`."""
     done = [outcome.entry for outcome in outcomes if not outcome.failure]
     scores = {entry.name: read_json(entry.job.run / "metrics.json")["scores"] for entry in done}
     known = [all_scores()[name] for name in SHOWN_SCORES if any(name in found for found in scores.values())]

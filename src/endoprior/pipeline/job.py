@@ -6,9 +6,11 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
+
+from typing_extensions import override
 
 from ..core.checks import input_error
 from ..core.config import Config
@@ -19,64 +21,49 @@ from ..data.files import read_json
 from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import input_facts, source_facts
-from ..prepare.frame_selection import FrameSelection
 from ..prepare.source import open_source
+from ..prepare.video_clip import FrameSelection, Moment
 from ..system.atomic import reject_occupied, write_json
 
-LEAST_RATE = 10.0
-"""Frame rate, 1/s, below which tissue and camera move too far between two frames to be followed."""
+LEAST_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed
 MOST_FRAMES = 10_000
-USUAL_FRAMES = 300
-"""A video with more frames loses some in between, as long as tissue can be followed."""
+USUAL_FRAMES = 300  # a video with more frames loses some in between, as long as tissue can be followed
 PREVIEW_FRAMES = 60
-PREVIEW_WIDTH = 320
-"""Width of the frames of a preview, px."""
+PREVIEW_WIDTH = 320  # width of the frames of a preview, px
 SETTINGS = "settings.json"
 """File in the output folder with everything that decides the results: a job that is resumed must have the same."""
-MOST_NAMED = 4
-"""Differences that a message names; more are counted."""
+MOST_NAMED = 4  # differences that a message names; more are counted
 
 
 @dataclass(frozen=True)
 class Part:
     """Part of a video."""
 
-    frames_per_second: float
-    """Rate of the frames that are used."""
-    start: float
-    """First time, seconds."""
-    end: float
-    """End time, seconds, not included; infinite for the end of the video."""
-    num_frames: int
-    """Number of frames."""
-    is_whole: bool
-    """Whether it reaches the end that was asked for."""
+    frames_per_second: float  # rate of the frames that are used
+    start: float  # first time, seconds
+    end: float  # end time, seconds, not included; infinite for the end of the video
+    num_frames: int  # number of frames
+    is_whole: bool  # whether it reaches the end that was asked for
 
 
 def choose_part(
-    times: Sequence[float],
-    rate: float,
-    wanted_rate: float,
-    start: float,
-    end: float,
-    most: int,
+    times: Sequence[float], rate: float, wanted_rate: float, start: float, end: float, most: int,
     usual: int | None = None,
-) -> Part:
+) -> Part:  # fmt: skip
     """The first part of a video that has at most `most` frames.
 
     A long video loses frames in between, down to `LEAST_RATE`, until it has at most `usual`, then its end.
 
     Args:
-        usual: None: `most`.
         times: when each image of the video is shown, s, ascending.
-        rate: usual one of the video, 1/s.
-        wanted_rate: rate that the user chose, 1/s; 0 for none.
+        rate, wanted_rate: usual one of the video, and that which the user chose, 1/s; 0 for none.
         start, end: times that the user chose; the end may be infinite.
+        usual: None: `most`.
     """
 
     def chosen(used: float, most: int) -> list[float]:
         """Times of the frames, up to `most`, that `prepare` selects."""
-        picked = FrameSelection(used, start, end, rate).pick(map(_Image, times))
+        picked = FrameSelection(used, start, end, rate).pick(map(Moment, count(), times))
         return [image.seconds for image in islice(picked, most)]
 
     every = 1
@@ -92,19 +79,25 @@ def choose_part(
     return Part(used, start, end, sum(time < end - 1e-9 for time in frames), False)
 
 
-@dataclass(frozen=True)
-class _Image:
-    seconds: float
+def _in_out(name: str, doc: str) -> property:
+    return property(lambda self: self.out / name, doc=doc)
 
 
 @dataclass(frozen=True)
 class SequenceJob:
     """A sequence folder on its way to a scene. Results are in `out`."""
 
-    source: Path
-    """What the user gave: the sequence folder."""
+    source: Path  # what the user gave: the sequence folder
     out: Path
     cfg: Config
+
+    run = _in_out("run", "The run folder: scene, scores, log, checkpoints.")
+    figure = _in_out("check.png", "The figure of `check`.")
+    findings = _in_out("check.json", "Facts and findings of `check`.")
+    notes = _in_out("notes.json", "What each finished step told the user.")
+    report = _in_out("report.png", "One image of held-out frames, curves and scores.")
+    rendered_video = _in_out("video.mp4", "Input, rendered model and depth beside each other.")
+    player = _in_out("player.html", "The page that plays the scene in a browser.")
 
     @property
     def is_preview(self) -> bool:
@@ -116,60 +109,23 @@ class SequenceJob:
         """The sequence folder."""
         return self.source
 
-    @property
-    def run(self) -> Path:
-        """The run folder: scene, scores, log, checkpoints."""
-        return self.out / "run"
-
-    @property
-    def figure(self) -> Path:
-        """The figure of `check`."""
-        return self.out / "check.png"
-
-    @property
-    def findings(self) -> Path:
-        """Facts and findings of `check`."""
-        return self.out / "check.json"
-
-    @property
-    def notes(self) -> Path:
-        """What each finished step told the user."""
-        return self.out / "notes.json"
-
-    @property
-    def report(self) -> Path:
-        """One image of held-out frames, curves and scores."""
-        return self.out / "report.png"
-
-    @property
-    def rendered_video(self) -> Path:
-        """Input, rendered model and depth beside each other."""
-        return self.out / "video.mp4"
-
-    @property
-    def player(self) -> Path:
-        """The page that plays the scene in a browser."""
-        return self.out / "player.html"
-
 
 @dataclass(frozen=True)
 class Job(SequenceJob):
     """A video on its way to a scene; it is prepared first."""
 
-    options: Options
-    """What the user chose, as it is typed; all else follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
-    prepare: PrepareConfig
-    """Options of `prepare`, for `part` only."""
+    options: Options  # what the user chose, as it is typed: `{"--preview": (), "--end": ("2.5",)}`; all else follows
+    prepare: PrepareConfig  # options of `prepare`, for `part` only
     part: Part
 
     @property
+    @override
     def is_preview(self) -> bool:
-        """See `SequenceJob`."""
         return "--preview" in self.options
 
     @property
+    @override
     def data(self) -> Path:
-        """The sequence folder, which `prepare` writes."""
         return self.out / "data"
 
 
@@ -198,10 +154,8 @@ def make_job(
 
 
 def open_folder(job: SequenceJob) -> bool:
-    """Create the output folder, or accept that of an interrupted job with the same settings.
+    """Create the output folder, or accept that of an interrupted job with the same settings; whether it was there.
 
-    Returns:
-        Whether the folder was there before.
     Raises:
         InputError: the folder holds something else, or a job with other settings; it names them.
     """

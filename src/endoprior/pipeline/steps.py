@@ -23,31 +23,26 @@ from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
+from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
 from ..runs.folder import CHECKPOINT, CONFIG
 from ..runs.log import mask_facts
 from ..runs.report import write_report
-from ..runs.train import start_run
-from ..runs.training_run import TrainingRun, WindowedRun
+from ..runs.train import TrainingRun, WindowedRun, start_run
 from ..system.atomic import write_json
 from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
 from .job import Job, SequenceJob
 
-PLAYER_BYTES = 40_000_000
-"""Largest player."""
-LEAST_BYTES = 7
-"""Size of one Gaussian at one time step in the player; at least this (docs/export.md)."""
+PLAYER_BYTES = 40_000_000  # largest player
+LEAST_BYTES = 7  # size of one Gaussian at one time step in the player; at least this (docs/export.md)
 PREVIEW_TITLE = "Preview: small frames, short training. Not for scores."
-CODE = re.compile("[a-z]+(-[a-z]+)*")
-"""Names of findings."""
-LOST_FRAMES = 5
-"""So many frames in a row without a pose: the camera is lost. Fewer are blurred or covered."""
-FEWEST_FRAMES = 20
-"""Fewer frames are not worth a scene."""
+CODE = re.compile("[a-z]+(-[a-z]+)*")  # names of findings
+LOST_FRAMES = 5  # so many frames in a row without a pose: the camera is lost. Fewer are blurred or covered.
+FEWEST_FRAMES = 20  # fewer frames are not worth a scene
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
 
 
@@ -56,18 +51,12 @@ class Step:
     """One step of a job."""
 
     name: str
-    result: Callable[[SequenceJob], Path]
-    """File or folder that is there when the step is done."""
-    act: Callable[[SequenceJob, Progress], list[str]]
-    """Does it; returns lines for the user."""
+    result: Callable[[SequenceJob], Path]  # file or folder that is there when the step is done
+    act: Callable[[SequenceJob, Progress], list[str]]  # does it; returns lines for the user
 
 
 def run_step(step: Step, job: SequenceJob, progress: Progress) -> list[str] | None:
-    """Do a step, and keep what it returns for a resumed job; None if it was done before.
-
-    Raises:
-        InputError: the input cannot be used.
-    """
+    """Do a step, and keep what it returns for a resumed job; None if it was done before."""
     if step.result(job).exists():
         return None
     lines = step.act(job, progress)
@@ -115,25 +104,34 @@ def problems(job: SequenceJob) -> str:
 def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[str]]:
     """The run of a job, new or resumed, and lines for the user."""
     sequence = load_sequence(job.data, job.cfg.data)
-    cfg, notes = job.cfg, list[str]()
-    usable = _usable(job, len(sequence)) if isinstance(job, Job) else len(sequence)
+    cfg, notes, usable = job.cfg, list[str](), len(sequence)
+    if isinstance(job, Job):
+        unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
+        findings = read_json(job.findings)["findings"]
+        cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
+        usable = usable_frames(len(sequence), unexplained, cuts)
     if usable < len(sequence):
         cfg = replace(cfg, data=replace(cfg.data, first_frames=usable))
         sequence = load_sequence(job.data, cfg.data)
         notes = [f"note: the camera is lost, or the scene changes, at frame {usable}: training uses the frames before"]
     begun = (job.run / CHECKPOINT).is_file() or (job.run / CONFIG).is_file()
-    return start_run(sequence, cfg, job.run, resume=begun, say=lambda text: None), notes
+    return start_run(sequence, cfg, job.run, resume=begun, say=lambda _text: None), notes
 
 
 def _train(job: SequenceJob, progress: Progress) -> list[str]:
     run, notes = start_training(job)
-    scene = run.complete(lambda report, trainer: progress("training", *trainer.progress()))
-    return [*notes, f"{len(scene):,} Gaussians"]
+    scene = run.complete(lambda _report, trainer: progress("training", *trainer.progress()))
+    return [*notes, f"{len(_of_gaussians(scene)):,} Gaussians"]
+
+
+def _of_gaussians(scene: RenderedScene) -> Scene:
+    assert isinstance(scene, Scene), "a job trains Gaussians"
+    return scene
 
 
 def _score(job: SequenceJob, progress: Progress) -> list[str]:
     progress("rendering held-out frames", 0, 0)
-    scene = load_scene(job.run)
+    scene = _of_gaussians(load_scene(job.run))
     sequence = _frames_of(job, scene.config)
     result = evaluate(scene, sequence, networks=False)
     result.protocol |= mask_facts(job.run)
@@ -145,7 +143,7 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
 
 
 def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
-    scene = load_scene(job.run)
+    scene = _of_gaussians(load_scene(job.run))
     frames = _frames_of(job, scene.config).with_poses(scene.cameras).frames("video")
     span = depth_span(scene)
 
@@ -167,7 +165,7 @@ def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
 
 def _player(job: SequenceJob, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
-    scene = load_scene(job.run)
+    scene = _of_gaussians(load_scene(job.run))
     at_a_time = len(scene) / len(scene.windows)
     times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video
@@ -190,21 +188,12 @@ STEPS = (
     Step("score", lambda job: job.report, _score),
     Step("video", lambda job: job.rendered_video, _render_video),
     Step("player", lambda job: job.player, _player),
-)
-"""In order. Every result is written completely or not at all."""
+)  # in order. Every result is written completely or not at all.
 
 
 def steps_of(job: SequenceJob) -> tuple[Step, ...]:
     """The steps that a job needs: a sequence folder is not prepared."""
     return STEPS if isinstance(job, Job) else STEPS[1:]
-
-
-def _usable(job: SequenceJob, num_frames: int) -> int:
-    """Number of frames that one scene can explain: see `usable_frames`."""
-    unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
-    findings = read_json(job.findings)["findings"]
-    cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
-    return usable_frames(num_frames, unexplained, cuts)
 
 
 def _frames_of(job: SequenceJob, cfg: Config) -> FrameSequence:

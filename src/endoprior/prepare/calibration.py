@@ -16,34 +16,24 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 
-MIN_BASELINE_MM, MAX_BASELINE_MM = 1.0, 30.0
-"""The baseline of stereo endoscopes is 3 to 6 mm; bench setups reach 30 mm."""
-NEGLIGIBLE = 1e-6
-"""Rotation, or vertical offset in mm, below which a pair without distortion counts as rectified."""
-CENTERED = 0.1
-"""Mean principal points of endoscopes are off the image center by less than this share of half the image ..."""
-FAR_OFF = 0.5
-"""... and if it is further off than this, the images were cropped or have another size."""
+MIN_BASELINE_MM, MAX_BASELINE_MM = 1.0, 30.0  # the baseline of stereo endoscopes is 3 to 6 mm; bench setups reach 30 mm
+NEGLIGIBLE = 1e-6  # rotation, or vertical offset in mm, below which a pair without distortion counts as rectified
+CENTERED = 0.1  # mean principal points are off the image center by less than this share of half the image ...
+FAR_OFF = 0.5  # ... and if further off than this, the images were cropped or have another size
 SAME_ASPECT = 0.01
-SQUEEZED = 0.12
-"""A factor from 2 that counts as 2, as a share: an image at half its width or height."""
+SQUEEZED = 0.12  # a factor from 2 that counts as 2, as a share: an image at half its width or height
 USUAL_RATIOS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
-NEAR_RATIO = 0.06
-"""An estimated ratio this near to a usual one is that one, as a share."""
-Size = tuple[int, int]
-"""(width, height) of one camera's image, px."""
+NEAR_RATIO = 0.06  # an estimated ratio this near to a usual one is that one, as a share
+Size = tuple[int, int]  # (width, height) of one camera's image, px
 
 
 @dataclass(frozen=True)
 class Intrinsics:
     """Camera matrix and lens distortion of one camera."""
 
-    matrix: NDArray[np.float64]
-    """(3, 3) K, px."""
-    distortion: NDArray[np.float64]
-    """(k,) OpenCV distortion coefficients, k in 0, 4, 5, 8, 12, 14; of a fisheye k1..k4."""
-    fisheye: bool = False
-    """OpenCV's fisheye model (equidistant, Kannala-Brandt): bent even where all coefficients are 0."""
+    matrix: NDArray  # (3, 3) K, px
+    distortion: NDArray  # (k,) OpenCV distortion coefficients, k in 0, 4, 5, 8, 12, 14; of a fisheye k1..k4
+    fisheye: bool = False  # OpenCV's model (equidistant, Kannala-Brandt): bent even where all coefficients are 0
 
     @property
     def bent(self) -> bool:
@@ -57,18 +47,12 @@ class Calibration:
 
     left: Intrinsics
     right: Intrinsics | None = None
-    rotation: NDArray[np.float64] | None = None
-    """(3, 3) R of x_right = R x_left + t."""
-    translation_mm: NDArray[np.float64] | None = None
-    """(3,) t, mm: about (-baseline, 0, 0)."""
-    size: Size | None = None
-    """Of the images that it was made for; None if the file does not state it."""
-    layout: str | None = None
-    """Text in the file that describes the stereo layout."""
-    size_is_sure: bool = False
-    """The user states the size, or this program wrote it: a principal point far from the center is a crop."""
-    notes: tuple[str, ...] = ()
-    """What the reader decided, one line each."""
+    rotation: NDArray | None = None  # (3, 3) R of x_right = R x_left + t
+    translation_mm: NDArray | None = None  # (3,) t, mm: about (-baseline, 0, 0)
+    size: Size | None = None  # of the images that it was made for; None if the file does not state it
+    layout: str | None = None  # text in the file that describes the stereo layout
+    size_is_sure: bool = False  # stated by the user, or by this program: a principal point far off means a crop
+    notes: tuple[str, ...] = ()  # what the reader decided, one line each
 
     @property
     def cameras(self) -> list[Intrinsics]:
@@ -80,10 +64,9 @@ class Calibration:
         """Whether the images are rectified already, and by one camera matrix: disparity 0 is infinitely far."""
         if self.right is None or self.rotation is None or self.translation_mm is None:
             return False
-        rotated = np.abs(self.rotation - np.eye(3)).max() > NEGLIGIBLE
-        shifted = np.abs(self.translation_mm[1:]).max() > NEGLIGIBLE
+        apart = max(np.abs(self.rotation - np.eye(3)).max(), np.abs(self.translation_mm[1:]).max())
         bent = self.left.bent or self.right.bent
-        return bool(not (bent or rotated or shifted) and np.allclose(self.left.matrix, self.right.matrix))
+        return bool(not bent and apart <= NEGLIGIBLE and np.allclose(self.left.matrix, self.right.matrix))
 
     def scaled(self, across: float, down: float, size: Size | None) -> Calibration:
         """For images that are resized by these factors, to this size."""
@@ -98,15 +81,15 @@ def check_pair(calibration: Calibration, name: str) -> float:
     Raises:
         InputError: one camera only, left and right swapped, cameras not side by side, or an implausible baseline.
     """
-    if calibration.right is None or calibration.rotation is None or calibration.translation_mm is None:
+    if calibration.right is None or calibration.translation_mm is None:
         raise input_error(name, "both cameras, R and T", "one camera", "Pass a stereo calibration, or `--layout mono`.")
     x, y, z = calibration.translation_mm
     if abs(x) < max(abs(y), abs(z)):
-        hint = "The cameras must be side by side: rotate images and calibration by 90 degrees."
-        raise input_error(name, "T along x", f"({x:g}, {y:g}, {z:g}) mm", hint)
+        fix = "The cameras must be side by side: rotate images and calibration by 90 degrees."
+        raise input_error(name, "T along x", f"({x:g}, {y:g}, {z:g}) mm", fix)
     if x > 0:
-        hint = "Swap left and right in the file, or write R and T that map left to right camera coordinates."
-        raise input_error(name, "T[0] < 0 (x_right = R x_left + T)", f"{x:g} mm: left and right are swapped", hint)
+        fix = "Swap left and right in the file, or write R and T that map left to right camera coordinates."
+        raise input_error(name, "T[0] < 0 (x_right = R x_left + T)", f"{x:g} mm: left and right are swapped", fix)
     baseline = float(np.linalg.norm(calibration.translation_mm))
     if not MIN_BASELINE_MM <= baseline <= MAX_BASELINE_MM:
         want = f"a baseline of {MIN_BASELINE_MM:g} to {MAX_BASELINE_MM:g} mm"
@@ -125,8 +108,9 @@ def written_in_order(size: Size, cameras: Sequence[Intrinsics]) -> Size:
     """A stated pair as (width, height): NumPy's shapes are (height, width), and the principal point tells."""
     if not cameras or not all((camera.matrix[:2, 2] > 0).all() for camera in cameras):
         return size
-    as_stated, turned = (np.abs(np.log(_ratios(cameras, pair))).sum() for pair in (size, size[::-1]))
-    return size[::-1] if turned < as_stated / 2 else size
+    other = size[1], size[0]
+    as_stated, turned = (np.abs(np.log(_ratios(cameras, pair))).sum() for pair in (size, other))
+    return other if turned < as_stated / 2 else size
 
 
 def fitted(calibration: Calibration, size: Size, name: str, *, squeezed: bool) -> tuple[Calibration, list[str]]:
@@ -139,8 +123,8 @@ def fitted(calibration: Calibration, size: Size, name: str, *, squeezed: bool) -
     Raises:
         InputError: its images had another shape, or the size of its images is unknown and not clear.
     """
-    shown = f"{size[0]}x{size[1]}"
-    if calibration.size is None:
+    shown, stated = f"{size[0]}x{size[1]}", calibration.size
+    if stated is None:
         across, down = _ratios(calibration.cameras, size)
         if max(abs(across - 1), abs(down - 1)) > CENTERED:
             raise _unknown_size(calibration, (across, down), size, name)
@@ -149,26 +133,24 @@ def fitted(calibration: Calibration, size: Size, name: str, *, squeezed: bool) -
             f"another size: --calibration-size WIDTHxHEIGHT"
         )
         return replace(calibration, size=size), [note]
-    stated = "{}x{}".format(*calibration.size)
-    across, down = size[0] / calibration.size[0], size[1] / calibration.size[1]
+    was, across, down = "{}x{}".format(*stated), size[0] / stated[0], size[1] / stated[1]
     if abs(across / down - 1) > SAME_ASPECT:
         fix = "Pass the calibration of this video, or set --layout."
         if not squeezed and _is_squeezed(down / across):
             fix = "`--squeezed-eyes` if both cameras share a frame at half their width or height; else set --layout."
         elif squeezed and _is_squeezed(across / down):
             fix = "Remove --squeezed-eyes."
-        raise input_error(name, f"images of {stated} px, or the same aspect ratio", shown, fix)
-    off = np.abs(_ratios(calibration.cameras, calibration.size) - 1)
-    if off.max() > FAR_OFF and not calibration.size_is_sure:
+        raise input_error(name, f"images of {was} px, or the same aspect ratio", shown, fix)
+    if np.abs(_ratios(calibration.cameras, stated) - 1).max() > FAR_OFF and not calibration.size_is_sure:
         x, y = calibration.left.matrix[:2, 2] - 0.5
-        hint = "Correct the size in the file, or state it: `--calibration-size WIDTHxHEIGHT`."
-        raise input_error(name, f"a principal point near the center of its {stated} px", f"({x:g}, {y:g})", hint)
-    if calibration.size == size:
+        fix = "Correct the size in the file, or state it: `--calibration-size WIDTHxHEIGHT`."
+        raise input_error(name, f"a principal point near the center of its {was} px", f"({x:g}, {y:g})", fix)
+    if stated == size:
         return calibration, []
-    return calibration.scaled(across, down, size), [f"the calibration is scaled from {stated} to {shown} px"]
+    return calibration.scaled(across, down, size), [f"the calibration is scaled from {was} to {shown} px"]
 
 
-def _ratios(cameras: Sequence[Intrinsics], size: Size) -> NDArray[np.float64]:
+def _ratios(cameras: Sequence[Intrinsics], size: Size) -> NDArray:
     """(2,) twice the mean principal point, in image widths and heights: 1 at the center."""
     return 2 * np.mean([camera.matrix[:2, 2] for camera in cameras], 0) / size
 
@@ -189,5 +171,4 @@ def _unknown_size(calibration: Calibration, ratios: tuple[float, float], size: S
 
 
 def _is_squeezed(aspect: float) -> bool:
-    """Whether one axis has twice the scale of the other."""
     return abs(aspect / 2 - 1) < SQUEEZED or abs(aspect * 2 - 1) < SQUEEZED

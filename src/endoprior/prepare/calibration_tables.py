@@ -18,12 +18,11 @@ import numpy as np
 import yaml
 
 from ..core.checks import InputError, input_error
-from ..data.colmap import StoredCamera, read_cameras
+from ..data.colmap import read_cameras
 from ..data.lens import MODELS, UNSUPPORTED
 from ..data.reading import BoundedLoader, load_yaml, read_bytes, read_numpy, read_text
 
-Table = dict[str, Any]
-"""Numbers, arrays and texts, by name in lower case without punctuation."""
+Table = dict[str, Any]  # numbers, arrays and texts, by name in lower case without punctuation
 FORMATS = "a calibration of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci, or rows of numbers"
 HINT = "Use the names K_left, distortion_left, K_right, distortion_right, R, T_mm, width, height (docs/prepare.md)."
 FOREIGN = {
@@ -31,12 +30,11 @@ FOREIGN = {
     b"\x89HDF": ("a .mat or .h5 file (HDF5)", "Write K and the distortion to a .json file."),
     b"\x80": ("a pickle, which could run programs", "Save it with numpy.savez, or as .json."),
     b"\xd0\xcf\x11\xe0": ("a document of an office program", "Export it as text."),
-}
-"""First bytes of formats that are not read: what they are, and what to do."""
+}  # first bytes of formats that are not read: what they are, and what to do
 COLMAP_LINE = re.compile(r"\d+\s+([A-Z_]{3,})\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
 INI_SECTION = re.compile(r"^\s*\[[A-Za-z][^\]=:]*\]\s*$", re.MULTILINE)
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-ONLY_NUMBERS = re.compile(rf"[\s,;\[\]()]*(?:{NUMBER}[\s,;\[\]()]+)*")
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+ONLY_NUMBERS = re.compile(rf"[\s,;\[\]()]*(?:{NUMBER.pattern}[\s,;\[\]()]+)*")
 
 
 def read_table(path: Path) -> Table:
@@ -72,23 +70,24 @@ def _content(path: Path) -> Any:
         if start.startswith(mark):
             raise input_error(path, FORMATS, what, fix)
     if path.name == "cameras.bin":
-        return _of_colmap(path, list(read_cameras(path).values()))
-    text = read_text(path, "a calibration file", "Check the path.", or_latin_1=True)
+        return _of_colmap(path)
+    return _of_text(path, read_text(path, "a calibration file", "Check the path.", or_latin_1=True))
+
+
+def _of_text(path: Path, text: str) -> Any:
     if text.lstrip().startswith("<"):
         return _of_xml(path, text)
     if path.suffix.lower() == ".json":
         return json.loads(text)
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    cameras = [COLMAP_LINE.fullmatch(line.strip()) for line in lines]
-    if lines and all(cameras):
-        return _of_colmap(path, list(read_cameras(path).values()))
+    if lines and all(COLMAP_LINE.fullmatch(line.strip()) for line in lines):
+        return _of_colmap(path)
     if lines and ONLY_NUMBERS.fullmatch("\n".join(lines) + "\n"):
-        numbers = [[float(word) for word in re.findall(NUMBER, line)] for line in lines]
-        numbers = [row for row in numbers if row]
+        numbers = [[float(word) for word in words] for words in map(NUMBER.findall, lines) if words]
         if len({len(row) for row in numbers}) == 1:
             return _of_rows(path, np.array(numbers))
-    if INI_SECTION.search(text):
-        return _of_ini(text)
+    if found := INI_SECTION.search(text):
+        return _of_ini(text[found.start() :])
     # OpenCV writes "%YAML:1.0", which is not YAML.
     return load_yaml("\n".join(line for line in text.splitlines() if not line.startswith("%YAML")), _Loader)
 
@@ -97,8 +96,12 @@ class _Loader(BoundedLoader):
     """Safe YAML that also knows OpenCV's matrices."""
 
 
+def _mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return loader.construct_mapping(node, True)
+
+
 for _name in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", lambda loader, node: loader.construct_mapping(node, True))
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _mapping)
 
 
 def _of_xml(path: Path, text: str) -> Any:
@@ -119,14 +122,21 @@ def _xml_value(node: ElementTree.Element) -> Any:
     if len(node):
         return {child.tag: _xml_value(child) for child in node}
     words = (node.text or "").replace('"', " ").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
+    numbers = _numbers(words)
+    if numbers is None:
         return " ".join(words)
     return numbers[0] if len(numbers) == 1 and node.tag != "data" else numbers
 
 
-def _of_colmap(path: Path, cameras: list[StoredCamera]) -> Table:
+def _numbers(words: list[str]) -> list[float] | None:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return None
+
+
+def _of_colmap(path: Path) -> Table:
+    cameras = list(read_cameras(path).values())
     if len(cameras) != 1:
         fix = "Keep this video's camera alone, in cameras.txt."
         raise input_error(path, "one camera of COLMAP, which writes no R and T", f"{len(cameras)} cameras", fix)
@@ -139,9 +149,9 @@ def _of_colmap(path: Path, cameras: list[StoredCamera]) -> Table:
     if len(names) != len(camera.values):
         raise input_error(path, f"{len(names)} numbers of {camera.model}", str(len(camera.values)), "Write it again.")
     found = dict(zip(names, camera.values, strict=True))
-    focal = {"fx": found["f"]} if "f" in found else {}
-    size = {"width": camera.width, "height": camera.height}
-    return {"camera_model": camera.model, "pixel_center": 0.5} | size | found | focal
+    found |= {"fx": found["f"]} if "f" in found else {}
+    facts = {"camera_model": camera.model, "pixel_center": 0.5, "width": camera.width, "height": camera.height}
+    return facts | found
 
 
 def _of_rows(path: Path, rows: np.ndarray) -> Table:
@@ -164,7 +174,7 @@ def _of_rows(path: Path, rows: np.ndarray) -> Table:
 def _of_ini(text: str) -> Table:
     """Sections named after a side get its name in front; `R_0 R_1 ...` become arrays."""
     parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"), strict=True)
-    parser.read_string(text[INI_SECTION.search(text).start() :])
+    parser.read_string(text)
     table: Table = {}
     for section in parser.sections():
         side = "left" if "left" in section.lower() else "right" if "right" in section.lower() else section
@@ -178,10 +188,8 @@ def _of_ini(text: str) -> Table:
 
 
 def _ini_value(text: str) -> Any:
-    words = text.strip(" []\"'").replace(",", " ").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
+    numbers = _numbers(text.strip(" []\"'").replace(",", " ").split())
+    if numbers is None:
         return text.strip(" \"'")
     return numbers[0] if len(numbers) == 1 else numbers
 
@@ -189,12 +197,13 @@ def _ini_value(text: str) -> Any:
 def _flat(content: Mapping[Any, Any], prefix: str = "") -> Table:
     table: Table = {}
     for name, value in content.items():
-        if isinstance(value, dict) and {"rows", "cols", "data"} <= {str(key) for key in value}:
-            table[f"{prefix}{name}"] = np.reshape(value["data"], (int(value["rows"]), int(value["cols"])))
-        elif isinstance(value, dict) and {"sizes", "data"} <= {str(key) for key in value}:
-            table[f"{prefix}{name}"] = np.reshape(value["data"], [int(n) for n in np.ravel(value["sizes"])])
-        elif isinstance(value, dict):
-            table |= _flat(value, f"{prefix}{name}.")
-        else:
+        keys = {str(key) for key in value} if isinstance(value, dict) else None
+        if keys is None:
             table[f"{prefix}{name}"] = value
+        elif {"rows", "cols", "data"} <= keys:
+            table[f"{prefix}{name}"] = np.reshape(value["data"], (int(value["rows"]), int(value["cols"])))
+        elif {"sizes", "data"} <= keys:
+            table[f"{prefix}{name}"] = np.reshape(value["data"], [int(n) for n in np.ravel(value["sizes"])])
+        else:
+            table |= _flat(value, f"{prefix}{name}.")
     return table

@@ -13,23 +13,33 @@ from .calibration_files import Unit
 from .stereo import StereoConfig
 
 Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]
-Rectangle = tuple[int, int, int, int]
-"""x, y, width, height in px, in one camera's image of the source video."""
+NETWORK, SAM2 = "depth-anything", "sam2"
+"""Values of --depth and --masks that a folder of weights, or the name of a model, may follow after a colon."""
+METHODS = ("auto", "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK, SAM2)
+"""Values of --depth, --masks and --poses that are no paths."""
+Rectangle = tuple[int, int, int, int]  # x, y, width, height in px, in one camera's image of the source video
 
 
 def parse_rectangle(text: str, option: str) -> Rectangle:
-    """`x,y,width,height` in px.
-
-    Raises:
-        InputError: the text has another form.
-    """
+    """`x,y,width,height` in px; InputError if the text has another form."""
+    want, fix = "x,y,width,height in px", f"`{option} 0,0,640,500`."
     try:
         x, y, width, height = (int(part) for part in text.split(","))
     except ValueError:
-        raise input_error(option, "x,y,width,height in px", repr(text), f"`{option} 0,0,640,500`.") from None
+        raise input_error(option, want, repr(text), fix) from None
     if min(x, y) < 0 or min(width, height) < 1:
-        raise input_error(option, "x, y >= 0 and width, height >= 1", repr(text), f"`{option} 0,0,640,500`.")
+        raise input_error(option, "x, y >= 0 and width, height >= 1", repr(text), fix)
     return x, y, width, height
+
+
+def names_path(value: str) -> bool:
+    """Whether a value of --depth, --masks or --poses is a file or folder of the user."""
+    return value not in METHODS and value.partition(":")[0] not in (NETWORK, SAM2)
+
+
+def is_sam2(value: str) -> bool:
+    """Whether a value of `--masks` or `--with` names this segmenter, rather than a folder."""
+    return value.partition(":")[0] == SAM2
 
 
 @dataclass(frozen=True)

@@ -6,29 +6,23 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import chain, pairwise
+from itertools import chain, islice, tee, zip_longest
 from typing import TypeVar
 
 import av
-import av.filter
 import numpy as np
 from av.container import InputContainer
+from av.error import BlockingIOError, EOFError, FFmpegError
+from av.filter import Graph
 from av.video.stream import VideoStream
 
-AVI = "avi"
-"""FFmpeg's name of the format that counts time in images and does not hold when they are shown."""
-DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800
-"""FFmpeg's bits of what a track is for."""
-SHORT = 0.5
-"""A track that lasts a smaller share of the longest one is a preview."""
-RATES = (0.01, 100_000.0)
-"""Plausible frame rates, 1/s."""
-USUAL_RATE = 25.0
-"""Frame rate of a file without times, 1/s."""
-NEAR = 0.25
-"""Time steps that differ from the median by less than this share are the usual step, up to rounding of the file."""
-SAME_RATE = 0.01
-"""A stated rate that differs from the measured one by less than this share is its exact value."""
+AVI = "avi"  # FFmpeg's name of the format that counts time in images and does not hold when they are shown
+DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800  # FFmpeg's bits of what a track is for
+SHORT = 0.5  # a track that lasts a smaller share of the longest one is a preview
+RATES = (0.01, 100_000.0)  # plausible frame rates, 1/s
+USUAL_RATE = 25.0  # frame rate of a file without times, 1/s
+NEAR = 0.25  # time steps that differ from the median by less than this share are the usual step
+SAME_RATE = 0.01  # a stated rate that differs from the measured one by less than this share is its exact value
 Item = TypeVar("Item")
 
 
@@ -37,35 +31,29 @@ class DecodedImage:
     """One image as the decoder gives it."""
 
     frame: av.VideoFrame
-    seconds: float | None
-    """Time in the file; None if it has no times."""
-    damaged: bool
-    """Bytes of it, or of an image that it was predicted from, are missing or wrong."""
-    interlaced: bool
-    """Whether the file says that its even and odd rows were taken at different times."""
-    turns: int
-    """Quarter turns, counterclockwise, that bring it upright."""
+    seconds: float | None  # time in the file; None if it has no times
+    damaged: bool  # bytes of it, or of an image that it was predicted from, are missing or wrong
+    interlaced: bool  # whether the file says that its even and odd rows were taken at different times
+    turns: int  # quarter turns, counterclockwise, that bring it upright
 
 
 @dataclass
 class Timeline:
     """Times that only increase, and counts of where those of the file do not."""
 
-    step: float
-    """Usual time between two images, s."""
-    restarts: int = 0
-    """How often time starts again, as where two recordings were joined."""
-    misplaced: int = 0
-    """Images whose time is not after that of the image before, while the next one is in order again."""
+    step: float  # usual time between two images, s
+    restarts: int = 0  # how often time starts again, as where two recordings were joined
+    misplaced: int = 0  # images whose time is not after that of the image before, while the next one is in order again
 
     def along(self, images: Iterable[tuple[Item, float | None]]) -> Iterator[tuple[Item, float]]:
-        """The images and their times, s. A misplaced image keeps its time; all others are later than those before.
+        """The images, in their order, and their times, s: of the file, None where it has none, and on this line.
 
-        Args:
-            images: in the order in which they are shown, with the times of the file; None where it has none.
+        A misplaced image keeps its time; all others are later than those before.
         """
         shift, last = 0.0, None
-        for (image, time), (_, following) in pairwise(chain(images, [(None, None)])):
+        images, ahead = tee(images)
+        for (image, time), after in zip(images, chain(islice(ahead, 1, None), [None]), strict=False):
+            following = after and after[1]
             now = (0.0 if last is None else last + self.step) if time is None else time + shift
             if time is not None and last is not None and now <= last:
                 if following is not None and following + shift > last:
@@ -103,14 +91,19 @@ def choose_track(container: InputContainer) -> VideoStream | None:
     Of several tracks, the one with the most pixels is taken, then the one that the file prefers, then the first.
     """
     tracks = [track for track in container.streams.video if track.codec_context is not None]
-    longest = max((float(track.duration * track.time_base) for track in tracks if track.duration), default=0.0)
+    longest = max((in_seconds(track, track.duration) for track in tracks), default=0.0)
 
     def rank(track: VideoStream) -> tuple[bool, bool, bool, int, bool]:
-        is_short = bool(track.duration) and float(track.duration * track.time_base) < SHORT * longest
+        is_short = bool(track.duration) and in_seconds(track, track.duration) < SHORT * longest
         size = (track.codec_context.width or 0) * (track.codec_context.height or 0)
         return not is_cover(track), track.frames != 1, not is_short, size, bool(int(track.disposition) & DEFAULT)
 
     return max(tracks, key=rank, default=None)
+
+
+def in_seconds(track: VideoStream, ticks: int | None) -> float:
+    """A time of a track, s; 0 without one."""
+    return float((ticks or 0) * (track.time_base or 0))
 
 
 def is_cover(track: VideoStream) -> bool:
@@ -119,17 +112,13 @@ def is_cover(track: VideoStream) -> bool:
 
 
 def packet_times(container: InputContainer, track: VideoStream) -> tuple[list[float | None], int]:
-    """The time of every image that is shown, in their order, s, None where there is none. Decodes nothing.
+    """The time of every image that is shown, in their order, s or None; and at which byte the last one lies.
 
     A file has its images in the order of decoding. Where the times of decoding start again, another part begins; within
-    a part, the images are shown in the order of their times.
-
-    Returns:
-        The times, and where in the file, in bytes, the last image lies.
+    a part, the images are shown in the order of their times. Nothing is decoded.
     """
     parts: list[list[int | None]] = [[]]
-    last: int | None = None
-    end = 0
+    last, end = None, 0
     try:
         for packet in _packets(container, track):
             end = max(end, packet.pos or 0)
@@ -140,10 +129,10 @@ def packet_times(container: InputContainer, track: VideoStream) -> tuple[list[fl
                     parts.append([])
                 last = packet.dts
             parts[-1].append(packet.pts if packet.pts is not None else packet.dts)
-    except av.error.FFmpegError:  # the decoder meets it, too, and says what is missing
+    except FFmpegError:  # the decoder meets it, too, and says what is missing
         pass
     ordered = [ticks for part in parts for ticks in sorted(part, key=lambda each: (each is None, each or 0))]
-    return [None if ticks is None else float(ticks * track.time_base) for ticks in ordered], end
+    return [None if ticks is None else in_seconds(track, ticks) for ticks in ordered], end
 
 
 def _packets(container: InputContainer, track: VideoStream) -> Iterator[av.Packet]:
@@ -163,21 +152,14 @@ def _packets(container: InputContainer, track: VideoStream) -> Iterator[av.Packe
 
 
 def decode(
-    container: InputContainer,
-    track: VideoStream,
-    lost: list[int | None],
-    *,
-    one_thread: bool = False,
-    weave: bool = False,
+    container: InputContainer, track: VideoStream, lost: list, *, one_thread: bool = False, weave: bool = False
 ) -> Iterator[DecodedImage]:
-    """The images in the order in which they are shown.
+    """The images in the order in which they are shown; FFmpegError if the file cannot be read on.
 
     Args:
         lost: gets the place, in ticks, of each image that is in the file and cannot be decoded.
         one_thread: slower; with threads, FFmpeg does not report all damage, and not always the same.
         weave: keep the rows of interlaced images as they are.
-    Raises:
-        av.error.FFmpegError: the file cannot be read on.
     """
     if not track.codec_context.is_open:
         track.thread_type = "NONE" if one_thread else "AUTO"
@@ -185,7 +167,7 @@ def decode(
     return images if weave else _deinterlaced(images)
 
 
-def _with_damage(container: InputContainer, track: VideoStream, lost: list[int | None]) -> Iterator[DecodedImage]:
+def _with_damage(container: InputContainer, track: VideoStream, lost: list) -> Iterator[DecodedImage]:
     """The images as stored.
 
     AVI holds the times at which images are decoded, not those at which they are shown. The decoder puts the images in
@@ -194,50 +176,38 @@ def _with_damage(container: InputContainer, track: VideoStream, lost: list[int |
     An image that is damaged damages those that are predicted from it, which the decoder does not report: all up to the
     next key frame.
     """
-    is_avi, decode_times = container.format.name == AVI, deque()
-    incomplete: set[int | None] = set()
-    spoiled = False
-    for packet, following in _with_following(_packets(container, track)):
+    is_avi, decode_times = container.format.name == AVI, deque[int]()
+    incomplete, spoiled = set[int | None](), False
+    first, second, third = tee(_packets(container, track), 3)
+    for packet, *following in zip_longest(first, islice(second, 1, None), islice(third, 2, None)):
         if is_avi and packet.dts is not None:
             decode_times.append(packet.dts)
         # Where the next part of a joined file begins, FFmpeg takes the end of the last part for a loss.
-        is_joint = packet.dts is not None and any(n.dts is not None and n.dts < packet.dts for n in following)
+        later = [each.dts for each in following if each is not None and each.dts is not None]
+        is_joint = packet.dts is not None and min(later, default=packet.dts) < packet.dts
         if packet.is_corrupt and not is_joint:
             incomplete.add(packet.pts)
         try:
             frames = track.decode(packet)
-        except av.error.FFmpegError:
+        except FFmpegError:
             lost.append(packet.dts)
             spoiled = True
             if is_avi and packet.dts is not None:
                 decode_times.pop()
             continue
         for frame in frames:
-            ticks = frame.pts
-            if is_avi:
-                ticks = decode_times.popleft() if decode_times else None
+            ticks = frame.pts if not is_avi else decode_times.popleft() if decode_times else None
             own = frame.is_corrupt or (frame.pts is not None and frame.pts in incomplete)
             incomplete.discard(frame.pts)
             spoiled = own or (spoiled and not frame.key_frame)
-            seconds = None if ticks is None else float(ticks * track.time_base)
+            seconds = None if ticks is None else in_seconds(track, ticks)
             turns = round(getattr(frame, "rotation", 0) / 90) % 4  # some cameras store it as metadata
             yield DecodedImage(frame, seconds, spoiled, frame.interlaced_frame, turns)
 
 
-def _with_following(packets: Iterator[av.Packet]) -> Iterator[tuple[av.Packet, list[av.Packet]]]:
-    """Each packet, and the two after it, fewer at the end."""
-    window: deque[av.Packet] = deque()
-    for packet in packets:
-        window.append(packet)
-        if len(window) > 2:
-            yield window.popleft(), list(window)
-    while window:
-        yield window.popleft(), list(window)
-
-
 def _deinterlaced(images: Iterator[DecodedImage]) -> Iterator[DecodedImage]:
     """From the first interlaced image on, each such image gets the rows of one field, and those between made anew."""
-    rows: _MissingRows | None = None
+    rows = None
     for image in images:
         if rows is None and not image.interlaced:
             yield image
@@ -259,7 +229,7 @@ class _MissingRows:
     def __init__(self, frame: av.VideoFrame) -> None:
         self.kind = _kind(frame)
         self._waiting: deque[DecodedImage] = deque()
-        self._graph = av.filter.Graph()
+        self._graph = Graph()
         source = self._graph.add_buffer(
             width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base or Fraction(1, 25)
         )
@@ -276,6 +246,6 @@ class _MissingRows:
         while self._waiting:
             try:
                 frame = self._graph.pull()
-            except (av.error.BlockingIOError, av.error.EOFError):
+            except (BlockingIOError, EOFError):
                 return
             yield replace(self._waiting.popleft(), frame=frame)

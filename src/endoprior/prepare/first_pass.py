@@ -22,32 +22,23 @@ from ..footage.round_border import CERTAIN
 from .calibration import fitted
 from .config import Layout, PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
-from .frame_selection import FrameSelection
 from .source import ImageFolder
-from .video_clip import Clip, EvenSample, StereoFrame
+from .video_clip import Clip, FrameSelection, StereoFrame
 
-SAMPLES = 24
-"""Number of frames used to detect borders, labels, tools and lighting."""
-DARK = 40.0
-"""Images whose brightest percent of values is below this are nearly black."""
-Mask = NDArray[np.bool_]
-Depth = NDArray[np.float32]
+SAMPLES = 24  # number of frames used to detect borders, labels, tools and lighting
+DARK = 40.0  # images whose brightest percent of values is below this are nearly black
+Image, Mask, Depth = NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class MeasuredFrame:
     """A rectified frame and its depth."""
 
-    position: int
-    """Position in the sequence, from 0."""
-    index: int
-    """Position in the source."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3)."""
-    right_u8: NDArray[np.uint8] | None
-    """(H, W, 3) image of the right camera, rectified; None if monocular."""
-    depth: Depth | None = None
-    """(H, W) mm, 0 where missing; None before it is measured."""
+    position: int  # position in the sequence, from 0
+    index: int  # position in the source
+    rgb_u8: Image  # (H, W, 3)
+    right_u8: Image | None  # (H, W, 3) image of the right camera, rectified; None if monocular
+    depth: Depth | None = None  # (H, W) mm, 0 where missing; None before it is measured
 
     @classmethod
     def of(cls, seen: StereoFrame, geometry: FrameGeometry, position: int = 0) -> MeasuredFrame:
@@ -60,21 +51,14 @@ class MeasuredFrame:
 class FirstPass:
     """Result of the first pass."""
 
-    indices: list[int]
-    """Positions of the selected frames in the source."""
-    samples: list[StereoFrame]
-    """At most `SAMPLES` of them, evenly spaced."""
+    indices: list[int]  # positions of the selected frames in the source
+    samples: list[StereoFrame]  # at most `SAMPLES` of them, evenly spaced
     geometry: FrameGeometry
-    notes: list[str] = field(default_factory=list)
-    """Notes for the user on borders and the lens, one line each."""
-    video_notes: list[str] = field(default_factory=list)
-    """What is particular about the video and which of its images are not used, one line each."""
-    damaged: frozenset[int] = frozenset()
-    """Those of `indices` whose images are damaged."""
-    stored_size: tuple[int, int] | None = None
-    """(width, height) of one camera's image before its pixels became square, px; None if they were."""
-    image_names: list[str] = field(default_factory=list)
-    """Of all images of a source folder, without suffixes; empty for a video."""
+    notes: list[str] = field(default_factory=list)  # notes for the user on borders and the lens, one line each
+    video_notes: list[str] = field(default_factory=list)  # on the video, and which of its images are not used
+    damaged: frozenset[int] = frozenset()  # those of `indices` whose images are damaged
+    stored_size: tuple[int, int] | None = None  # (width, height) of one camera's image of pixels that are not square
+    image_names: list[str] = field(default_factory=list)  # of a source folder, without suffixes; empty for a video
 
     def frame_of(self, read: Callable[[tuple[int, int]], NDArray]) -> NDArray:
         """The frame (H, W) of a file that has the size of the source images, of the frames, or of the stored pixels.
@@ -91,9 +75,8 @@ class FirstPass:
             with suppress(InputError):
                 if self.stored_size is not None:
                     values = read(self.stored_size)
-                    kind = np.uint8 if values.dtype == bool else values.dtype
-                    how = cv2.INTER_NEAREST_EXACT
-                    square = cv2.resize(values.astype(kind), geometry.source_size, interpolation=how)
+                    stored = values.astype(np.uint8 if values.dtype == bool else values.dtype)
+                    square = cv2.resize(stored, geometry.source_size, interpolation=cv2.INTER_NEAREST_EXACT)
                     return geometry.values(square.astype(values.dtype))
             raise
 
@@ -104,19 +87,25 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     Raises:
         InputError: too few or too many frames, or a file is damaged.
     """
+    path, size = clip.source.path, clip.camera_size
     indices, damaged, samples, selection = _look_through(clip, cfg)
     if clip.was_damaged:  # again, now by one thread, which finds all damage
         indices, damaged, samples, selection = _look_through(clip, cfg)
     if len(indices) < 2:
-        hint = "Check --start, --end and --frames-per-second."
-        raise input_error(str(clip.source.path), "at least 2 frames in the selection", str(len(indices)), hint)
+        fix = "Check --start, --end and --frames-per-second."
+        raise input_error(str(path), "at least 2 frames in the selection", str(len(indices)), fix)
     lefts = [frame.left for frame in samples]
-    video_notes = [*clip.notes, *_timing_notes(selection, cfg), *_brightness_notes(lefts), *_comb_notes(clip, lefts)]
-    notes: list[str] = []
-    calibration, name = clip.calibration, str(cfg.calibration)
-    stretch = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
+    video_notes = [*clip.notes, *_timing_notes(selection, cfg)]
+    brightest = float(np.median([np.percentile(image, 99) for image in lefts]))
+    if brightest < DARK:
+        words = f"their brightest parts have {brightest:.0f} of 255. Export them brighter"
+        video_notes.append(f"the images are nearly black: {words}")
+    if clip.layout != "interlaced" and are_combed(lefts):
+        video_notes.append(_comb_note(clip))
+    calibration, name, notes = clip.calibration, str(cfg.calibration), list[str]()
+    across, down = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
     if calibration is not None:
-        full = clip.camera_size[0] * stretch[0], clip.camera_size[1] * stretch[1]
+        full = size[0] * across, size[1] * down
         calibration, words = fitted(calibration, full, name, squeezed=cfg.squeezed_eyes)
         notes += [*calibration.notes, *words]
     strips = circle = outside = None
@@ -124,24 +113,16 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     if cfg.border == "auto":
         outline = find_outline(lefts)
         circle, strips, outside = outline.circle, outline.strips or None, outline.outside
-        labels = [tuple(box) for box in find_static_overlays([_without(p, strips) for p in lefts])]
+        labels = find_static_overlays([_without(image, strips) for image in lefts])
     blank = [parse_rectangle(text, "--blank") for text in cfg.blank]
     for rectangle in blank:
-        demand_within(rectangle, clip.camera_size, "--blank")
+        demand_within(rectangle, size, "--blank")
     geometry = make_geometry(
-        clip.camera_size,
-        calibration,
-        stereo=clip.stereo,
-        name=name,
-        stretch=stretch,
-        field_of_view_degrees=cfg.field_of_view_degrees,
-        max_width=cfg.max_width,
-        crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None,
-        blank=[*labels, *blank],
-        strips=strips,
-        circle=circle,
-        outside=outside,
-    )
+        size, calibration, stereo=clip.stereo, name=name, stretch=(across, down),
+        field_of_view_degrees=cfg.field_of_view_degrees, max_width=cfg.max_width,
+        crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None, blank=[*labels, *blank],
+        strips=strips, circle=circle, outside=outside,
+    )  # fmt: skip
     notes += border_notes(strips, circle, labels, float(1 - geometry.inside.mean()))
     if calibration is None:
         notes.append(
@@ -156,19 +137,20 @@ def _look_through(
     clip: Clip, cfg: PrepareConfig
 ) -> tuple[list[int], frozenset[int], list[StereoFrame], FrameSelection]:
     """Positions of the selected frames, the damaged ones, samples, and the selection; InputError if too many."""
-    selection, sample = clip.selection(), EvenSample(SAMPLES)
-    indices: list[int] = []
-    damaged: set[int] = set()
-    for stereo_frame in clip.stereo_frames(selection):
-        sample.add(stereo_frame)
-        indices.append(stereo_frame.index)
-        if stereo_frame.damaged:
-            damaged.add(stereo_frame.index)
+    indices, damaged, samples, every, selection = list[int](), set[int](), list[StereoFrame](), 1, clip.selection()
+    for count, frame in enumerate(clip.stereo_frames(selection)):
+        if count % every == 0 and len(samples) == SAMPLES:
+            samples, every = samples[::2], 2 * every
+        if count % every == 0:
+            samples.append(frame)
+        indices.append(frame.index)
+        if frame.damaged:
+            damaged.add(frame.index)
         if len(indices) > cfg.max_frames:
             got = f"{clip.source.num_frames or 'more'} in the file"
-            hint = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
-            raise input_error(str(clip.source.path), f"at most {cfg.max_frames} frames", got, hint)
-    return indices, frozenset(damaged), sample.kept, selection
+            fix = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
+            raise input_error(str(clip.source.path), f"at most {cfg.max_frames} frames", got, fix)
+    return indices, frozenset(damaged), samples, selection
 
 
 def _stretch(layout: Layout) -> tuple[int, int]:
@@ -179,12 +161,11 @@ def _stretch(layout: Layout) -> tuple[int, int]:
     return (2, 1) if layout == "side-by-side" else (1, 2)
 
 
-def _without(image: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint8]:
+def _without(image: Image, strips: Strips | None) -> Image:
     """The image with its strips painted black, so that their text is not detected again."""
     if not strips:
         return image
-    height, width = image.shape[:2]
-    clean = np.zeros_like(image)
+    clean, (height, width) = np.zeros_like(image), image.shape[:2]
     part = slice(strips.top, height - strips.bottom), slice(strips.left, width - strips.right)
     clean[part] = image[part]
     return clean
@@ -204,25 +185,14 @@ def _timing_notes(selection: FrameSelection, cfg: PrepareConfig) -> list[str]:
     return notes
 
 
-def _brightness_notes(images: list[NDArray[np.uint8]]) -> list[str]:
-    """A note if the brightest parts of most images are nearly black."""
-    brightest = float(np.median([np.percentile(image, 99) for image in images]))
-    if brightest >= DARK:
-        return []
-    return [f"the images are nearly black: their brightest parts have {brightest:.0f} of 255. Export them brighter"]
-
-
-def _comb_notes(clip: Clip, images: list[NDArray[np.uint8]]) -> list[str]:
-    """A note, with the command that helps, if images of a progressive video have rows of two times."""
-    if clip.layout == "interlaced" or not are_combed(images):
-        return []
-    path = clip.source.path
-    fix = "deinterlace the video before its images are exported"
+def _comb_note(clip: Clip) -> str:
+    """That images of a progressive video have rows of two times, and the command that helps."""
+    path, fix = clip.source.path, "deinterlace the video before its images are exported"
     if not isinstance(clip.source, ImageFolder):
         even = path.with_name(f"{path.stem}_progressive.mp4")
         words = ["ffmpeg", "-i", path, "-vf", "bwdif=deint=all", "-crf", "10", even]
         fix = f"`{' '.join(map(quoted, words))}`"
-    return [f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"]
+    return f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"
 
 
 def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,7 @@ from ..core.checks import input_error
 from ..data.description import ESTIMATED_POSES, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
 from ..data.files import list_files
-from ..data.folder_edits import (
-    POSES,
-    demand_writable,
-    depth_bounds,
-    pose_table,
-    replace_depth,
-    replace_poses,
-)
+from ..data.folder_edits import POSES, demand_writable, depth_bounds, pose_table, replace_depth, replace_poses
 from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
 from ..footage.changes import find_changes
@@ -36,22 +29,17 @@ STATIC = "static camera"
 class FolderPath:
     """What was found and written."""
 
-    camera_to_world: NDArray[np.float64]
-    """(T, 4, 4) mm."""
-    relative: bool
-    """Lengths have no unit."""
-    unexplained: list[int]
-    """Frames without a pose, or of another scene."""
-    kept: Path | None
-    """The file of the poses that were there, if it was kept."""
-    notes: list[str]
-    """Notes for the user, one line each."""
+    camera_to_world: NDArray[np.float64]  # (T, 4, 4) mm
+    relative: bool  # lengths have no unit
+    unexplained: list[int]  # frames without a pose, or of another scene
+    kept: Path | None  # the file of the poses that were there, if it was kept
+    notes: list[str]  # notes for the user, one line each
 
 
 def write_folder_path(
     folder: Path,
     how: str = "auto",
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
     *,
     reading: Reading = AS_OURS,
 ) -> FolderPath:
@@ -76,31 +64,28 @@ def write_folder_path(
     fx, fy, cx, cy = intrinsics_of(folder / "sequence.json", described, width, height, focal)
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     tool_value, relative = described.get("mask_tool_value", 255), described.get("depth_relative", False)
+    sources, count = described.get("sources", {}), len(images)
 
-    def colors() -> Iterator[NDArray[np.uint8]]:
-        return (read_color(file, size) for file in images)
+    def color(index: int) -> NDArray[np.uint8]:
+        return read_color(images[index], size)
 
     def tissue(index: int) -> NDArray[np.bool_]:
         return ~read_tool_mask(masks[index], tool_value, size)
 
-    def frame(index: int) -> PoseInput:
-        return PoseInput(read_color(images[index], size), tissue(index), read_depth(depths[index], scale, size))
-
-    sources = described.get("sources", {})
     path, notes = sequence_path(
         how,
-        frame,
-        lambda: (colors(), map(tissue, range(len(images)))),
-        len(images),
+        lambda i: PoseInput(color(i), tissue(i), read_depth(depths[i], scale, size)),
+        lambda: (map(color, range(count)), map(tissue, range(count))),
+        count,
         Lens.centered_at_half(matrix, width, relative, described.get("baseline_mm")),
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
         reading=replace(reading, image_names=names),
-        progress=lambda done: progress(done, len(images)),
+        progress=lambda done: progress(done, count),
     )
-    unexplained = sorted({*(path.lost if path else []), *find_changes(colors()).off_color})
-    count = len(images)
+    lost = path.lost if path else list[int]()
+    unexplained = sorted({*lost, *find_changes(map(color, range(count))).off_color})
     new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
     if relative and path is not None:
         scaled = zip(depths, path.depth_scale, strict=True)

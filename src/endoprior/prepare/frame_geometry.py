@@ -18,45 +18,34 @@ from ..core.checks import input_error
 from ..core.ranges import spread
 from ..footage.border import Circle, Strips
 from ..footage.stereo_order import row_offsets_px
-from .calibration import Calibration, Intrinsics, check_pair
+from .calibration import Calibration, Intrinsics, Size, check_pair
 from .config import Rectangle
 
 MIN_SIDE_PX = 32
-LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0
-"""A rectified focal length outside of this range, as a share of the calibrated one, comes from wrong coefficients."""
-MOST_LOST = 0.2
-"""So much of an image may be lost: corners outside of a round image, where nothing was measured."""
-COMPARED = 8
-"""Number of frames in which the offset between the rows of both cameras is measured ..."""
-FEWEST = 40
-"""... and of matching features, over all of them, that it needs."""
-Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0  # wrong coefficients give a focal length outside of these shares
+MOST_LOST = 0.2  # so much of an image may be lost: corners outside of a round image, where nothing was measured
+COMPARED = 8  # number of frames in which the offset between the rows of both cameras is measured ...
+FEWEST = 40  # ... and of matching features, over all of them, that it needs
+Maps = tuple[NDArray, NDArray]
+Pair = tuple[Maps | None, Maps | None]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class FrameGeometry:
     """How every source image becomes a frame."""
 
-    source_size: tuple[int, int]
-    """(width, height) of one camera's source image, px."""
-    maps: tuple[Maps | None, Maps | None]
-    """Where each pixel of the rectified left and right image lies in the source; None if the images are rectified."""
-    cut: Rectangle
-    """Part of the rectified image to keep."""
-    size: tuple[int, int]
-    """(width, height) of a frame, px."""
-    matrix: NDArray[np.float64]
-    """(3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5."""
-    turn: NDArray[np.float64]
-    """(3, 3) rotation from the axes of the source's left camera to those of the frames."""
-    baseline_mm: float | None
-    """None if monocular."""
-    blank: NDArray[np.bool_]
-    """(h, w) of the source: True where images are painted black."""
-    inside: NDArray[np.bool_]
-    """(H, W) of a frame: True inside the endoscope's field of view."""
+    source_size: Size  # (width, height) of one camera's source image, px
+    maps: Pair  # where the pixels of the rectified images lie in the source; None if these are rectified
+    cut: Rectangle  # part of the rectified image to keep
+    size: Size  # (width, height) of a frame, px
+    matrix: NDArray  # (3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5
+    turn: NDArray  # (3, 3) rotation from the axes of the source's left camera to those of the frames
+    baseline_mm: float | None  # None if monocular
+    blank: Mask  # (h, w) of the source: True where images are painted black
+    inside: Mask  # (H, W) of a frame: True inside the endoscope's field of view
 
-    def image(self, rgb_u8: NDArray[np.uint8], right: bool = False) -> NDArray[np.uint8]:
+    def image(self, rgb_u8: NDArray, right: bool = False) -> NDArray:
         """The frame (H, W, 3) of a source image (h, w, 3)."""
         if self.blank.any():
             rgb_u8 = np.where(self.blank[..., None], np.uint8(0), rgb_u8)
@@ -80,20 +69,10 @@ class FrameGeometry:
 
 
 def make_geometry(
-    size: tuple[int, int],
-    calibration: Calibration | None,
-    *,
-    stereo: bool,
-    name: str,
-    stretch: tuple[int, int] = (1, 1),
-    field_of_view_degrees: float,
-    max_width: int,
-    crop: Rectangle | None = None,
-    blank: Sequence[Rectangle] = (),
-    strips: Strips | None = None,
-    circle: Circle | None = None,
-    outside: NDArray[np.bool_] | None = None,
-) -> FrameGeometry:
+    size: Size, calibration: Calibration | None, *, stereo: bool, name: str, stretch: Size = (1, 1),
+    field_of_view_degrees: float, max_width: int, crop: Rectangle | None = None, blank: Sequence[Rectangle] = (),
+    strips: Strips | None = None, circle: Circle | None = None, outside: Mask | None = None,
+) -> FrameGeometry:  # fmt: skip
     """Compute the geometry of all frames.
 
     Args:
@@ -107,34 +86,23 @@ def make_geometry(
     Raises:
         InputError: the crop leaves too little, or the calibration does not fit.
     """
-    width, height = size
-    keep = np.ones((height, width), bool)
-    if crop is not None:
-        demand_within(crop, size, "--crop")
-        x, y, w, h = crop
-        keep[:] = False
-        keep[y : y + h, x : x + w] = True
-    if strips:
-        keep[: strips.top] = keep[height - strips.bottom :] = False
-        keep[:, : strips.left] = keep[:, width - strips.right :] = False
-    if circle:
-        keep &= circle.mask(width, height, circle.margin_px)
-    if outside is not None:
-        keep &= ~outside
-    painted = np.zeros_like(keep)
+    full, painted = (size[0] * stretch[0], size[1] * stretch[1]), np.zeros(size[::-1], bool)
     for x, y, w, h in blank:
         painted[y : y + h, x : x + w] = True
-    full, baseline = (width * stretch[0], height * stretch[1]), None
+    keep = _kept(size, crop, strips, circle)
+    if outside is not None:
+        keep &= ~outside
+    baseline, turn = None, np.eye(3)
+    maps: Pair = None, None
     if calibration is None:
         # A round border of a squeezed image is no circle.
         matrix = _assumed(*full, circle if full == size else None, field_of_view_degrees)
-        turn, maps = np.eye(3), (None, None)
     else:
         baseline = check_pair(calibration, name) if stereo else None
         matrix, turn, maps = rectify(calibration, full, name, stereo=stereo)
     maps = _stretched(maps[0], full, stretch), _stretched(maps[1], full, stretch)
 
-    def warped(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def warped(mask: Mask) -> Mask:
         return mask if maps[0] is None else cv2.remap(mask.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
 
     cut = _bounding_box(warped(keep))
@@ -147,7 +115,22 @@ def make_geometry(
     return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, turn, baseline, painted, inside)
 
 
-def demand_within(rectangle: Rectangle, size: tuple[int, int], option: str) -> None:
+def _kept(size: Size, crop: Rectangle | None, strips: Strips | None, circle: Circle | None) -> Mask:
+    """(h, w) True on the part of the source to keep."""
+    width, height = size
+    keep = np.ones((height, width), bool)
+    if crop is not None:
+        demand_within(crop, size, "--crop")
+        x, y, w, h = crop
+        keep[:] = False
+        keep[y : y + h, x : x + w] = True
+    if strips:
+        keep[: strips.top] = keep[height - strips.bottom :] = False
+        keep[:, : strips.left] = keep[:, width - strips.right :] = False
+    return keep & circle.mask(width, height, circle.margin_px) if circle else keep
+
+
+def demand_within(rectangle: Rectangle, size: Size, option: str) -> None:
     """Raise InputError unless a rectangle lies within an image of this (width, height), px."""
     x, y, width, height = rectangle
     if x + width > size[0] or y + height > size[1]:
@@ -160,11 +143,11 @@ def _cut(image: NDArray, cut: Rectangle) -> NDArray:
     return np.ascontiguousarray(image[y : y + height, x : x + width])
 
 
-def _shrink(image: NDArray, size: tuple[int, int]) -> NDArray:
+def _shrink(image: NDArray, size: Size) -> NDArray:
     return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> NDArray[np.float64]:
+def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> NDArray:
     """K of a camera with an assumed field of view."""
     extent, x, y = width / 2, width / 2, height / 2
     if circle is not None:
@@ -173,7 +156,7 @@ def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> 
     return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1.0]])
 
 
-def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:
+def _bounding_box(keep: Mask) -> Rectangle:
     rows, columns = np.flatnonzero(keep.any(1)), np.flatnonzero(keep.any(0))
     if len(rows) < MIN_SIDE_PX or len(columns) < MIN_SIDE_PX:
         hint = "Use a larger --crop, or `--border keep`."
@@ -181,17 +164,15 @@ def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:
     return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
 
 
-def rectify(
-    calibration: Calibration, size: tuple[int, int], name: str, *, stereo: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[Maps | None, Maps | None]]:
-    """Rectify images of this (width, height), px. Every pixel of the result shows something.
+def rectify(calibration: Calibration, size: Size, name: str, *, stereo: bool) -> tuple[NDArray, NDArray, Pair]:
+    """Rectify images of this (width, height), px, so that every pixel of the result shows something.
 
     Args:
         calibration: in px of these images; with both cameras if `stereo`.
         name: of its file, for error messages.
     Returns:
-        (3, 3) K of both rectified cameras, with the left-most pixel centered at 0.5; (3, 3) rotation from the axes of
-        the left camera to those of the rectified one; and the maps of the left and the right image.
+        (3, 3) K of both rectified cameras; (3, 3) rotation from the axes of the left camera to those of the rectified
+        one; and the maps.
     Raises:
         InputError: the distortion cannot be undone, or only one lens is a fisheye.
     """
@@ -205,7 +186,7 @@ def rectify(
     return matrix, turn, maps
 
 
-def _single(camera: Intrinsics, size: tuple[int, int]):
+def _single(camera: Intrinsics, size: Size) -> tuple[NDArray, NDArray, Pair]:
     if not camera.bent:
         return camera.matrix, np.eye(3), (None, None)
     k, bent = _moved(camera.matrix, -0.5), camera.distortion
@@ -216,7 +197,7 @@ def _single(camera: Intrinsics, size: tuple[int, int]):
     return _moved(better, 0.5), np.eye(3), (_maps(camera, np.eye(3), better, size), None)
 
 
-def _pair(calibration: Calibration, size: tuple[int, int], name: str):
+def _pair(calibration: Calibration, size: Size, name: str) -> tuple[NDArray, NDArray, Pair]:
     left, right = calibration.left, calibration.right
     assert right is not None and calibration.rotation is not None and calibration.translation_mm is not None
     if calibration.rectified:
@@ -236,32 +217,32 @@ def _pair(calibration: Calibration, size: tuple[int, int], name: str):
     return _moved(p1[:, :3], 0.5), r1, maps
 
 
-def _moved(matrix: NDArray, by: float) -> NDArray[np.float64]:
+def _moved(matrix: NDArray, by: float) -> NDArray:
     """K with its principal point moved: OpenCV counts pixel centers from 0, this package from 0.5."""
     moved = matrix.copy()
     moved[:2, 2] += by
     return moved
 
 
-def _maps(camera: Intrinsics, turn: NDArray, matrix: NDArray, size: tuple[int, int]) -> Maps:
+def _maps(camera: Intrinsics, turn: NDArray, matrix: NDArray, size: Size) -> Maps:
     """Args: matrix: K of the rectified camera, px counted from 0."""
     make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
     return make(_moved(camera.matrix, -0.5), camera.distortion, turn, matrix, size, cv2.CV_32FC1)
 
 
-def _lost(maps: Maps, size: tuple[int, int]) -> float:
+def _lost(maps: Maps, size: Size) -> float:
     """Share of the rectified pixels that are outside of the source image, or whose neighbors change sides in it."""
     (x_down, x_across), (y_down, y_across) = (np.gradient(of) for of in maps)
     shown = (maps[0] > -1) & (maps[0] < size[0]) & (maps[1] > -1) & (maps[1] < size[1])
     return float((~shown | (x_across * y_down - x_down * y_across <= 0)).mean())
 
 
-def _identity(size: tuple[int, int]) -> Maps:
-    columns, rows = np.meshgrid(np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32))
+def _identity(size: Size) -> Maps:
+    columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size))
     return columns, rows
 
 
-def _stretched(maps: Maps | None, size: tuple[int, int], stretch: tuple[int, int]) -> Maps | None:
+def _stretched(maps: Maps | None, size: Size, stretch: Size) -> Maps | None:
     """Maps into an image squeezed to 1 / stretch (across, down), from those into the image of this size."""
     if stretch == (1, 1):
         return maps
@@ -271,23 +252,19 @@ def _stretched(maps: Maps | None, size: tuple[int, int], stretch: tuple[int, int
 
 
 def with_rows_moved(geometry: FrameGeometry, offset_px: float) -> FrameGeometry:
-    """The geometry whose right frames are moved up by a row offset, px of a frame, so that the rows of a pair agree.
-
-    Args:
-        offset_px: y_right - y_left of the same points.
-    """
+    """The geometry whose right frames are moved up by a row offset y_right - y_left, px of a frame."""
     old = geometry.maps[1]
     offset = np.float32(offset_px * geometry.cut[3] / geometry.size[1])
     columns, rows = _identity(geometry.source_size if old is None else old[0].shape[::-1])
     maps = columns, rows + offset
     if old is not None:  # maps are smooth: those of the rows below, 0 beyond the image
-        beyond = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": -1e4}
-        maps = tuple(cv2.remap(each, *maps, cv2.INTER_LINEAR, **beyond) for each in old)
+        of, how = maps, {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_CONSTANT, "borderValue": -1e4}
+        maps = cv2.remap(old[0], *of, **how), cv2.remap(old[1], *of, **how)
     return replace(geometry, maps=(geometry.maps[0], maps))
 
 
 def with_equal_rows(
-    geometry: FrameGeometry, pairs: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8] | None]]
+    geometry: FrameGeometry, pairs: Sequence[tuple[NDArray, NDArray | None]]
 ) -> tuple[FrameGeometry, str]:
     """The geometry that moves the right images so that the rows of both cameras agree, and a note.
 
@@ -298,14 +275,13 @@ def with_equal_rows(
     Raises:
         InputError: one camera, or too few features match.
     """
-    fix = "Remove `--row-offset auto`."
-    if any(right is None for _, right in pairs):
+    fix, both = "Remove `--row-offset auto`.", [(left, right) for left, right in pairs if right is not None]
+    if len(both) < len(pairs):
         raise input_error("--row-offset", "two cameras", "one camera", fix)
-    pairs = [pairs[i] for i in spread(len(pairs), COMPARED)]
+    both = [both[i] for i in spread(len(both), COMPARED)]
 
-    def offsets(of: FrameGeometry) -> NDArray[np.float64]:
-        images = ((of.image(left), of.image(right, right=True)) for left, right in pairs)
-        return np.concatenate([row_offsets_px(*both) for both in images])
+    def offsets(of: FrameGeometry) -> NDArray:
+        return np.concatenate([row_offsets_px(of.image(left), of.image(right, right=True)) for left, right in both])
 
     before = offsets(geometry)
     if len(before) < FEWEST:

@@ -1,64 +1,70 @@
-"""Second pass over a clip: choose how depth and masks are made, rectify and measure each frame, write the files."""
+"""Second pass over a clip: choose how depth and masks are made, rectify and measure each frame, write the files.
+
+Tools are found in the frames, read from the user's files, or followed by a video segmenter.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import chain, islice, repeat
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.config import DataConfig
 from ..core.ranges import spread
-from ..data.found_tools import FoundTools
-from ..data.frame_files import match_files
-from ..data.images import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
+from ..data import load_sequence
+from ..data.description import TOOLS_FOUND
+from ..data.folder_edits import found_source, write_mask
+from ..data.found_tools import FoundTools, FrameRow, write_rows
+from ..data.frame_files import match_files, match_names
+from ..data.images import DEPTH_SUFFIXES, read_color, read_depth_file, read_stored, read_values, save_png
+from ..data.mask_files import tool_polarity
+from ..data.mask_folders import open_mask_folder
 from ..data.pixels import is_measured
-from ..data.writer import FrameFiles
+from ..data.writer import TOOL_VALUE, FrameFiles
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
-from .config import PrepareConfig
-from .first_pass import Depth, FirstPass, Mask, MeasuredFrame
+from .config import NETWORK, PrepareConfig, is_sam2
+from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
-from .masks import Tools, choose_tools
-from .relative_depth import DEFAULT_MODEL, DepthNetwork, Kind, fit_reference, fit_shading, relative_to_mm
+from .relative_depth import RelativeScale, fit_shading
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
 
-REACH = 2
-"""Number of frames on each side in the temporal depth filter."""
-FITTED_SAMPLES = 16
-"""Number of frames to which the tool and shading models are fitted."""
-MAX_ROW_OFFSET_PX = 1.5
-"""If the rows of the two cameras are further apart, stereo matching is poor."""
-NETWORK = "depth-anything"
+if TYPE_CHECKING:
+    from ..tool_masks.sequence import Progress
+    from ..tool_masks.video_segmenter import VideoSegmenter
+
+REACH = 2  # number of frames on each side in the temporal depth filter
+FITTED_SAMPLES = 16  # number of frames to which the tool and shading models are fitted
+MAX_ROW_OFFSET_PX = 1.5  # if the rows of the two cameras are further apart, stereo matching is poor
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
+COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete
+HINT = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
+WORK = "carried"  # folder of the segmenter's masks until the sequence is complete, for an interrupted run
+Tools = Callable[[MeasuredFrame], FoundTools]  # the tools of a frame; those that the user gives have confidence 1
 
 
 @dataclass(frozen=True)
 class FrameMethods:
     """How depth and masks of one clip are made."""
 
-    measure: Measure | None
-    """Depth that needs no mask: stereo, files, a network."""
-    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None
-    """Depth from the shading of an image inside a mask."""
+    measure: Measure | None  # depth that needs no mask: stereo, files, a network
+    shade: Callable[[Image, Mask], Depth] | None  # depth from the shading of an image inside a mask
     tools: Tools
-    filter_in_time: bool
-    """Whether to filter depth over neighboring frames."""
-    wanted: Callable[[NDArray[np.uint8]], bool]
-    """Whether an image (H, W, 3) belongs in the sequence."""
-    sources: dict[str, str]
-    """Where images, depth and masks come from."""
-    relative: bool
-    """Whether the scale of the depth is assumed."""
-    notes: list[str]
-    """Notes for the user, one line each."""
+    filter_in_time: bool  # whether to filter depth over neighboring frames
+    wanted: Callable[[Image], bool]  # whether an image (H, W, 3) belongs in the sequence
+    sources: dict[str, str]  # where images, depth and masks come from
+    relative: bool  # whether the scale of the depth is assumed
+    notes: list[str]  # notes for the user, one line each
 
 
 def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> FrameMethods:
@@ -72,12 +78,9 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
     notes = _check_stereo(samples, clip) if clip.stereo else []
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
-    measure, source = None, kind
-    if kind not in ("none", "shading"):
-        measure, source, depth_notes = _measured_depth(kind, cfg, clip, first_pass)
-        notes += depth_notes
+    measure, source, depth_notes = _measured_depth(kind, cfg, first_pass)
     tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples)
-    notes += mask_notes
+    notes += depth_notes + mask_notes
     shade = None
     if relative:
         images, usable = [f.rgb_u8 for f in samples], [geometry.inside & ~tools(f).mask for f in samples]
@@ -89,16 +92,17 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
             f"depth is relative ({source}), with its median set to {cfg.working_distance_mm:g}: lengths have no unit "
             "(rel.). For mm use a stereo video or measured depth."
         )
-    elif kind == "folder":
+    elif kind == "folder" and measure is not None:
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
-    wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
+    wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
     return FrameMethods(measure, shade, tools, kind == "sgbm", wanted, sources, relative, notes)
 
 
 def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
     """Reject swapped cameras; return a note if the rows do not match."""
-    pairs = [(frame.rgb_u8, frame.right_u8) for frame in samples][:: max(len(samples) // 3, 1)]
+    pairs = [(frame.rgb_u8, frame.right_u8) for frame in samples if frame.right_u8 is not None]
+    pairs = pairs[:: max(len(samples) // 3, 1)]
     orders = [stereo_order(*pair) for pair in pairs]
     if sum(order.swapped for order in orders) > len(orders) / 2:
         fix = "Remove --swap-eyes." if clip.swap else "Add --swap-eyes."
@@ -113,11 +117,7 @@ def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
 
 
 def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
-    """The depth method that --depth selects.
-
-    Raises:
-        InputError: --depth-relative without a depth folder.
-    """
+    """The depth method that --depth selects; InputError for --depth-relative without a depth folder."""
     if cfg.depth == "auto":
         kind: DepthKind = "sgbm" if clip.stereo else "shading"
     elif cfg.depth in ("none", "sgbm", "shading"):
@@ -130,23 +130,17 @@ def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
 
 
 def _measured_depth(
-    kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass
-) -> tuple[Measure, str, list[str]]:
+    kind: DepthKind, cfg: PrepareConfig, first_pass: FirstPass
+) -> tuple[Measure | None, str, list[str]]:
     """A function that measures depth without a mask (mm, or relative values of a network), its name, and notes."""
-    geometry = first_pass.geometry
+    if kind in ("none", "shading"):
+        return None, kind, []
     if kind == "sgbm":
-        if not clip.stereo or geometry.baseline_mm is None:
-            fix = "`--calibration FILE` with both cameras, or `--depth shading`."
-            raise input_error("--depth sgbm", "two cameras and their calibration", "one camera", fix)
-        focal, baseline = float(geometry.matrix[0, 0]), geometry.baseline_mm
-
-        def match(frame: MeasuredFrame) -> Depth:
-            assert frame.right_u8 is not None
-            return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo).depth
-
-        return match, "stereo: semi-global matching", []
+        return _matched_depth(cfg, first_pass.geometry), "stereo: semi-global matching", []
     if kind == "network":
-        network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
+        from .networks import DepthNetwork  # imports torch
+
+        network = DepthNetwork(cfg.depth.partition(":")[2])
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
     files, notes = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
     if cfg.depth_relative == "no":
@@ -165,11 +159,24 @@ def _measured_depth(
     return lambda frame: first_pass.frame_of(lambda size: read(files[frame.index], size)), "user's files", notes
 
 
+def _matched_depth(cfg: PrepareConfig, geometry: FrameGeometry) -> Measure:
+    baseline, focal = geometry.baseline_mm, float(geometry.matrix[0, 0])
+    if baseline is None:
+        fix = "`--calibration FILE` with both cameras, or `--depth shading`."
+        raise input_error("--depth sgbm", "two cameras and their calibration", "one camera", fix)
+
+    def match(frame: MeasuredFrame) -> Depth:
+        assert frame.right_u8 is not None
+        return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo)
+
+    return match
+
+
 def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], cfg: PrepareConfig) -> Measure:
     """Relative values scaled to the working distance by constants of the clip."""
-    kind: Kind = "depth" if cfg.depth_relative == "depth" else "disparity"
-    reference = fit_reference([measure(frame) for frame in samples], usable, kind, cfg.working_distance_mm)
-    return lambda frame: relative_to_mm(measure(frame), kind, reference)
+    kind = "depth" if cfg.depth_relative == "depth" else "disparity"
+    scale = RelativeScale.fit(kind, [measure(frame) for frame in samples], usable, cfg.working_distance_mm)
+    return lambda frame: scale.mm(measure(frame))
 
 
 def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: FrameGeometry, folder: str) -> list[str]:
@@ -194,10 +201,80 @@ def _check_stored(images: list[NDArray]) -> list[str]:
     return notes
 
 
-def _inside_body(images: list[NDArray[np.uint8]]) -> Callable[[NDArray[np.uint8]], bool]:
-    """A function that tells whether an image has the usual color of the samples."""
-    usual = np.median([color_share(image) for image in images], 0)
-    return lambda rgb_u8: bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)
+def _inside_body(images: list[Image]) -> Callable[[Image], bool]:
+    """A function that tells whether an image has the usual color of these; any image has if there are none."""
+    usual = np.median([color_share(image) for image in images], 0) if images else None
+    return lambda rgb_u8: usual is None or bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)
+
+
+def names_folder(masks: str) -> bool:
+    """Whether a value of --masks is a folder of the user."""
+    return masks not in ("auto", "none") and not is_sam2(masks)
+
+
+def masked_frames(cfg: PrepareConfig, first_pass: FirstPass) -> tuple[frozenset[int], int, str] | None:
+    """The frames with a mask, if there are fewer masks than frames, as in StereoMIS; None if masks decide nothing.
+
+    Returns:
+        Their positions in the source, the usual distance between them in selected frames, and a note for the user.
+    """
+    if not names_folder(cfg.masks):
+        return None
+    indices, image_names = first_pass.indices, first_pass.image_names
+    given = open_mask_folder(Path(cfg.masks), cfg.mask_labels)
+    if given.in_order_only or len(given.frames) in (len(indices), len(image_names)):
+        return None
+    names = [frame.name for frame in given.frames]
+    found = match_names(Path(cfg.masks), names, indices, image_names, required=()).files
+    places = np.searchsorted(indices, sorted(found))
+    if len(found) in (1, len(indices)) or np.ptp(places) < COVERED * (len(indices) - 1):
+        return None
+    step = int(np.median(np.diff(places)))
+    every = f"one for every {step} frames; " if step > 1 else ""
+    left_out = f"{len(indices) - len(found)} of {len(indices)} frames have none and are left out"
+    return frozenset(found), step, f"masks: {every}{left_out}"
+
+
+def choose_tools(
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
+) -> tuple[Tools, str, list[str]]:
+    """A function that returns the tools of a frame, the name of its source, and notes."""
+    inside = first_pass.geometry.inside
+    if names_folder(cfg.masks):
+        return _given_tools(cfg, first_pass, samples)
+    if cfg.mask_labels:
+        raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
+    if cfg.masks == "none":
+        return lambda _frame: FoundTools(np.zeros_like(inside), 1.0), "none", []
+    from ..tool_masks import ToolFinder  # imports torch
+
+    finder = ToolFinder()
+    share = np.mean([finder.find(sample.rgb_u8, inside).mask.any() for sample in samples])
+    source = f"{TOOLS_FOUND} in {share:.0%} of the samples" if share else f"no {TOOLS_FOUND}"
+    hint = HINT if share else "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
+    notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
+    return lambda frame: finder.find(frame.rgb_u8, inside), source, notes
+
+
+def _given_tools(
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
+) -> tuple[Tools, str, list[str]]:
+    """As `choose_tools`, from the user's files."""
+    path = Path(cfg.masks)
+    given = open_mask_folder(path, cfg.mask_labels)
+    names = [each.name for each in given.frames]
+    matched = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
+
+    def high(frame: MeasuredFrame) -> Mask:
+        return first_pass.frame_of(given.frames[matched.files[frame.index]].read)
+
+    notes = [f"masks: {each}" for each in (given.note, matched.rule) if each]
+    tool_is_high = given.tool_is_high
+    if tool_is_high is None or cfg.mask_tool_value != "auto":
+        polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
+        tool_is_high = polarity.tool_is_high
+        notes.append(f"masks: {polarity.reason}")
+    return lambda frame: FoundTools(high(frame) == tool_is_high, 1.0), "user's files", notes
 
 
 def measure_frames(
@@ -219,22 +296,13 @@ def measure_frames(
 
 def with_neighbors(frames: Iterable[MeasuredFrame]) -> Iterator[list[MeasuredFrame]]:
     """For each frame, the window centered on it: `REACH` frames on each side, fewer at both ends."""
-    window: deque[MeasuredFrame] = deque(maxlen=2 * REACH + 1)
-    at = -1  # position of the center frame in the window
-
-    def around() -> list[MeasuredFrame]:
-        reach = min(at, len(window) - 1 - at)
-        return list(window)[at - reach : at + reach + 1]
-
-    for frame in frames:
-        at -= len(window) == window.maxlen
-        window.append(frame)
-        if len(window) > REACH:
-            at += 1
-            yield around()
-    while at < len(window) - 1:
-        at += 1
-        yield around()
+    padded = chain(repeat(None, REACH), frames, repeat(None, REACH))
+    window = deque(islice(padded, 2 * REACH), 2 * REACH + 1)
+    for last in padded:
+        window.append(last)
+        sides = list(window)[:REACH], list(window)[REACH + 1 :]
+        reach = min(REACH - side.count(None) for side in sides)
+        yield [frame for frame in list(window)[REACH - reach : REACH + reach + 1] if frame is not None]
 
 
 def write_frames(
@@ -263,7 +331,7 @@ def write_frames(
             continue
         depth = frame.depth
         if methods.filter_in_time:
-            depth = temporal_median([other.depth for other in window])
+            depth = temporal_median([other.depth for other in window if other.depth is not None])
         found = methods.tools(frame)
         on_tools(frame.position, found)
         tools = found.mask | ~geometry.inside
@@ -275,3 +343,46 @@ def write_frames(
         files.add(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
         on_frame(files.count)
     return used
+
+
+def replace_by_carried(
+    files: FrameFiles,
+    segmenter: VideoSegmenter,
+    inside: Mask,
+    shade: Callable[[Image, Mask], Depth] | None,
+    progress: Progress,
+) -> list[str]:
+    """Replace the masks of all written frames, their depth from shading, and the source of the masks in `files.meta`.
+
+    The frames are written first, with the masks of our own finder, because the segmenter goes through them in both
+    directions. To call this again after an interruption gives the same files.
+
+    Args:
+        inside: (H, W) True inside the endoscope's image.
+        shade: depth from the shading of an image inside a mask; None if depth does not depend on masks.
+    Returns:
+        Notes for the user, one line each.
+    """
+    from ..tool_masks.mask_store import MaskStore, read_state, write_state  # imports torch
+    from ..tool_masks.video_segmenter import segment_sequence
+
+    work = files.folder / WORK
+    store = MaskStore(work / "masks", (files.meta.width, files.meta.height))
+    if "rows" not in read_state(work):
+        files.finish()  # a reader needs the description; it is written again at the end
+        sequence, found_rows = load_sequence(files.folder, DataConfig(format="plain")), []
+        for i, (mask, found) in enumerate(segment_sequence(sequence, segmenter, work / "work", progress=progress)):
+            store.put(i, mask)
+            found_rows.append(asdict(FrameRow.of(i, found)))
+        write_state(work, {"rows": found_rows})
+    for i in range(files.count):
+        mask = store.mask(i) | ~inside
+        write_mask(files.file("masks", i), mask, TOOL_VALUE)
+        if shade is not None:
+            depth = np.where(inside, shade(read_color(files.file("images", i)), ~mask), np.float32(0))
+            save_png(files.file("depth", i), files.depth_units(depth))
+    rows = [FrameRow(**row) for row in read_state(work)["rows"]]
+    write_rows(files.folder, rows)
+    source = found_source(sum(row.share > 0 for row in rows) / files.count, segmenter.name)
+    files.meta = replace(files.meta, sources=files.meta.sources | {"masks": source})
+    return [f"masks: {source}. {HINT}"]

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error, number_ranges
-from ..core.shell import command
+from ..core.shell import changed_options, command
 from ..data import write_stir_tracks
-from ..data.description import SIZE_NOT_STATED
+from ..data.description import SIZE_NOT_STATED, PrepareRecord
 from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncertain_frames
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
@@ -23,18 +26,15 @@ from .calibration import parse_size
 from .calibration_files import read_calibration
 from .camera_path.sequence_path import ASSUMED, CALIBRATED, PATH_RECORD, Reading, rescaled, sequence_path
 from .camera_path.tracks import CameraPath, Lens, PoseInput
-from .config import PrepareConfig
+from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
-from .frame_geometry import with_equal_rows
-from .frames import FrameMethods, choose_methods, write_frames
-from .masks import masked_frames, remove_carried, replace_by_carried
-from .record import record_of
-from .sam2 import is_sam2, open_sam2
+from .frame_geometry import FrameGeometry, with_equal_rows
+from .frames import WORK, FrameMethods, choose_methods, masked_frames, replace_by_carried, write_frames
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
-DEPTH_SCALE = 0.01
-"""mm per unit of the 16-bit depth files: up to 655 mm."""
+DEPTH_SCALE = 0.01  # mm per unit of the 16-bit depth files: up to 655 mm
+GRID_POINTS = 9  # points a side of the grid over a rectified frame; between them the rectification is nearly linear
 Progress = Callable[[str, int, int], None]
 """Called with the name of the step, the number of items done, and their total (0: unknown)."""
 
@@ -51,8 +51,22 @@ class Prepared:
     """Notes for the user, one line each."""
 
 
+class _Written(FrameFiles):
+    """The frames of a sequence, to read again."""
+
+    def color(self, index: int) -> NDArray[np.uint8]:
+        return read_color(self.file("images", index))
+
+    def tools(self, index: int) -> NDArray[np.bool_]:
+        return read_tool_mask(self.file("masks", index))
+
+    def pose_input(self, index: int) -> PoseInput:
+        depth = read_depth(self.file("depth", index), self.meta.depth_scale)
+        return PoseInput(self.color(index), ~self.tools(index), depth)
+
+
 def prepare(
-    video: Path, out: Path, cfg: PrepareConfig | None = None, progress: Progress = lambda what, done, total: None
+    video: Path, out: Path, cfg: PrepareConfig | None = None, progress: Progress = lambda _what, _done, _total: None
 ) -> Prepared:
     """Write a sequence folder from a video. The same call resumes after an interruption.
 
@@ -66,7 +80,11 @@ def prepare(
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
         _demand_all_frames(cfg)
-    segmenter = open_sam2(cfg.masks, "--masks") if is_sam2(cfg.masks) else None
+    segmenter = None
+    if is_sam2(cfg.masks):
+        from .networks import open_sam2  # imports torch
+
+        segmenter = open_sam2(cfg.masks, "--masks")
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
         clip, first_pass, step = _look(video, cfg, progress)
@@ -77,23 +95,25 @@ def prepare(
         if files.count < 2:
             fix = "Change --start, --end or --drop-out-of-body."
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
-        carried_notes = []
+        carried_notes, moving = [], []
         if segmenter is not None:
             carried_notes = replace_by_carried(files, segmenter, inside, methods.shade, progress)
-        moving = _unmasked(files, inside) if cfg.masks == "auto" or segmenter is not None else []
+        if cfg.masks == "auto" or segmenter is not None:
+            from .unmasked_motion import frames_with_unmasked_motion  # imports torch
+
+            rate = files.meta.frames_per_second
+            moving = frames_with_unmasked_motion(files.count, rate, files.color, files.tools, inside)
         mark_moving(folder, moving)
         path, motion_notes = _camera_path(cfg, files, first_pass, used, progress)
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
         unexplained = _unexplained(path, files, damaged)
         if path is not None:
             _use_path(files, path)
-        remove_carried(files)
+        shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
         RowLog(folder).remove()
         files.finish(None if path is None else path.camera_to_world, unexplained)
-        video_notes = [*first_pass.video_notes, *_damage_notes(damaged)]
-        if outside := len(first_pass.indices) - len(used):
-            video_notes.append(f"{outside} frames without the color of the inside of a body are left out")
-        record_of(video, cfg, first_pass.geometry, video_notes).save(folder)
+        video_notes = [*first_pass.video_notes, *_usage_notes(damaged, len(first_pass.indices) - len(used))]
+        _record(video, cfg, first_pass.geometry, video_notes).save(folder)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
         others = sorted({*unexplained} - {*damaged})
@@ -123,21 +143,16 @@ def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, Fi
 
 
 def _write(
-    folder: Path,
-    cfg: PrepareConfig,
-    clip: Clip,
-    first_pass: FirstPass,
-    methods: FrameMethods,
-    step: int,
+    folder: Path, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int,
     progress: Progress,
-) -> tuple[FrameFiles, list[int]]:
+) -> tuple[_Written, list[int]]:  # fmt: skip
     """Write the frames that are not there yet; and the position in the source of every frame."""
     parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
     found, done, finds_tools = RowLog(folder), frames_done(folder, parts), cfg.masks == "auto"
     if finds_tools:
         done = min(done, len(found.rows))
         found.cut(done)
-    files = FrameFiles(folder, _meta(clip, first_pass, methods, step), done)
+    files = _Written(folder, _meta(clip, first_pass, methods, step), done)
     used = write_frames(
         clip.stereo_frames(clip.selection()),
         first_pass.geometry,
@@ -169,24 +184,18 @@ def _meta(clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int) -
 
 
 def _camera_path(
-    cfg: PrepareConfig, files: FrameFiles, first_pass: FirstPass, used: Sequence[int], progress: Progress
+    cfg: PrepareConfig, files: _Written, first_pass: FirstPass, used: Sequence[int], progress: Progress
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
-    meta, turn = files.meta, first_pass.geometry.turn
+    meta, turn, everything = files.meta, first_pass.geometry.turn, range(files.count)
     progress("following the camera", 0, files.count)
-
-    def frame(index: int) -> PoseInput:
-        depth = read_depth(files.file("depth", index), meta.depth_scale)
-        return PoseInput(_color(files, index), ~_tools(files, index), depth)
-
     matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
     # Poses of a file are those of the source's left camera, which rectification turns.
     turn = None if np.array_equal(turn, np.eye(3)) else turn
-    everything = range(files.count)
     return sequence_path(
         cfg.poses,
-        frame,
-        lambda: ((_color(files, i) for i in everything), (~_tools(files, i) for i in everything)),
+        files.pose_input,
+        lambda: (map(files.color, everything), (~files.tools(i) for i in everything)),
         files.count,
         Lens.centered_at_half(matrix, meta.width, meta.depth_relative, meta.baseline_mm),
         (meta.width, meta.height),
@@ -204,46 +213,29 @@ def _use_path(files: FrameFiles, path: CameraPath) -> None:
         for index, scale in enumerate(path.depth_scale):
             file = files.file("depth", index)
             save_png(file, rescaled(decode_image(file, None), float(scale)))
-    focal = {"fx": files.meta.fx * path.focal_factor, "fy": files.meta.fy * path.focal_factor}
-    files.meta = replace(files.meta, **focal, sources=path.sources(files.meta.sources))
+    fx, fy = files.meta.fx * path.focal_factor, files.meta.fy * path.focal_factor
+    files.meta = replace(files.meta, fx=fx, fy=fy, sources=path.sources(files.meta.sources))
     files.write_json(PATH_RECORD, path.record())
 
 
-def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
-    """Written frames in which something moves that no mask covers."""
-    from .unmasked_motion import frames_with_unmasked_motion  # imports torch
-
-    rate = files.meta.frames_per_second
-    return frames_with_unmasked_motion(
-        files.count, rate, lambda i: _color(files, i), lambda i: _tools(files, i), inside
-    )
-
-
-def _unexplained(path: CameraPath | None, files: FrameFiles, damaged: list[int]) -> list[int]:
+def _unexplained(path: CameraPath | None, files: _Written, damaged: list[int]) -> list[int]:
     """Damaged frames, and those without a pose or of another scene than the frames that are not damaged."""
     whole = sorted({*range(files.count)} - {*damaged})
     if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
         return damaged
-    other_scene = [whole[i] for i in find_changes(_color(files, i) for i in whole).off_color]
+    other_scene = [whole[i] for i in find_changes(map(files.color, whole)).off_color]
     return sorted({*damaged, *(path.lost if path else []), *other_scene})
 
 
-def _color(files: FrameFiles, index: int) -> NDArray[np.uint8]:
-    return read_color(files.file("images", index))
-
-
-def _tools(files: FrameFiles, index: int) -> NDArray[np.bool_]:
-    return read_tool_mask(files.file("masks", index))
-
-
-def _damage_notes(damaged: list[int]) -> list[str]:
-    """A note about frames whose bytes are damaged."""
-    if not damaged:
-        return []
-    what = "damaged in the video, or predicted from damaged images before the next key frame"
-    fix = "leave them out with --start and --end, or copy the video again"
-    frames = number_ranges(damaged)
-    return [f"{what}: frames {frames}. They are unexplained_frames of sequence.json; {fix}"]
+def _usage_notes(damaged: list[int], outside: int) -> list[str]:
+    notes = []
+    if damaged:
+        what = "damaged in the video, or predicted from damaged images before the next key frame"
+        fix = "leave them out with --start and --end, or copy the video again"
+        notes.append(f"{what}: frames {number_ranges(damaged)}. They are unexplained_frames of sequence.json; {fix}")
+    if outside:
+        notes.append(f"{outside} frames without the color of the inside of a body are left out")
+    return notes
 
 
 def _advice(out: Path, uncertain: list[int], moving: list[int], others: list[int], usable: int) -> list[str]:
@@ -265,3 +257,35 @@ def _demand_all_frames(cfg: PrepareConfig) -> None:
     options = {"--start": cfg.start > 0, "--end": cfg.end < math.inf, "--drop-out-of-body": cfg.drop_out_of_body}
     if left_out := [name for name, is_set in options.items() if is_set]:
         raise input_error("--stir", "all frames of the clip", left_out[0], f"remove {left_out[0]}.")
+
+
+def _record(video: Path, cfg: PrepareConfig, geometry: FrameGeometry, video_notes: Sequence[str]) -> PrepareRecord:
+    """What is kept of the call, so that the command can be repeated. Args: video_notes: what `check` repeats."""
+    options = changed_options(cfg)
+    for name in ("--depth", "--masks", "--poses"):
+        if name in options:
+            options[name] = (_absolute(options[name][0]),)
+    source, grid = os.path.abspath(video), _source_px(geometry)
+    return PrepareRecord(source, options, geometry.source_size, grid, tuple(video_notes))
+
+
+def _absolute(value: str) -> str:
+    """A method, or the absolute path of a file or folder."""
+    if names_path(value):
+        return os.path.abspath(value)
+    method, colon, folder = value.partition(":")  # a folder, or the name of a network on a server
+    return f"{method}:{os.path.abspath(folder)}" if colon and os.path.isdir(folder) else value
+
+
+def _source_px(geometry: FrameGeometry) -> tuple[tuple[tuple[float, ...], ...], ...]:
+    """Where an even grid over the frame lies in the source image, px; a pixel is 1 wide and its center at a half."""
+    x, y, width, height = geometry.cut
+    count = 2 if geometry.maps[0] is None else GRID_POINTS
+    columns, rows = np.meshgrid(np.linspace(x, x + width, count), np.linspace(y, y + height, count))
+    grid = np.stack([columns, rows], -1)
+    if geometry.maps[0] is not None:
+        # The maps have one entry for each pixel, at its center, and count centers from 0.
+        at = (columns - 0.5).astype(np.float32), (rows - 0.5).astype(np.float32)
+        maps = [cv2.remap(of, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for of in geometry.maps[0]]
+        grid = np.stack(maps, -1) + 0.5
+    return tuple(tuple(tuple(round(float(v), 2) for v in point) for point in row) for row in grid)

@@ -16,23 +16,22 @@ from numpy.typing import NDArray
 from PIL.Image import DecompressionBombError, Image
 from PIL.Image import open as open_image
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..data.files import entries, files_with
 from ..data.frame_files import one_per_frame
 from ..data.images import decode_image, describe_pixels
-from ..data.reading import MOST_PIXELS, kind_of
+from ..data.reading import kind_of
 from ..data.video_files import STILL_SUFFIXES, is_animated_webp
 from .decoding import usual_rate
-from .video import SourceFrame, Video, too_many_pixels
+from .video import COPY_AGAIN, SourceFrame, Video, demand_size
 
-OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")
-"""Suffixes of images that are counted, but not read."""
+OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")  # suffixes of images that are counted, but not read
 
 
 class ImageFolder:
     """Images of one size, in the order of the numbers in their names: of 8 bits, or as many as are in use of 16."""
 
-    start, was_damaged = 0.0, False
+    start, was_damaged, clock_is_arbitrary = 0.0, False, False
 
     def __init__(self, path: Path, frames_per_second: float) -> None:
         """List the folder; raises InputError if it has no images, or several of each frame."""
@@ -47,18 +46,18 @@ class ImageFolder:
     @property
     def notes(self) -> list[str]:
         """What is particular about the images, one line each."""
-        found = [self._left_out] if self._left_out else []
+        found = []
         visible = [file for file in entries(self.path) if file.name[0] != "."]
         if others := [file for file in visible if file.suffix.lower() in OTHER_IMAGES]:
             kinds = ", ".join(sorted({file.suffix for file in others}))
-            found.append(f"{self.path.name}: {len(others)} images of other kinds ({kinds}) are not used")
+            found.append(f"{len(others)} images of other kinds ({kinds}) are not used")
         stacks = [file for file in self.files if file.suffix.lower() in (".tif", ".tiff")]
         if pages := sum(max(cv2.imcount(str(file)) - 1, 0) for file in stacks):
-            found.append(f"{self.path.name}: only the first image of each TIFF is used; {pages} more are not")
+            found.append(f"only the first image of each TIFF is used; {pages} more are not")
         if self._bits != 8:
-            what = f"images of 16 bits a channel: {self._bits} of 16 bits are in use, which become 0 to 255"
-            found.append(f"{self.path.name}: {what}")
-        return found
+            found.append(f"images of 16 bits a channel: {self._bits} of 16 bits are in use, which become 0 to 255")
+        left_out = [self._left_out] if self._left_out else []
+        return left_out + [f"{self.path.name}: {words}" for words in found]
 
     def __iter__(self) -> Iterator[SourceFrame]:
         return map(self.image, range(len(self.files)))
@@ -99,7 +98,7 @@ class ImageFolder:
 class Animation:
     """An animated WebP file, which FFmpeg does not read."""
 
-    start, notes, was_damaged = 0.0, (), False
+    start, notes, was_damaged, clock_is_arbitrary = 0.0, (), False, False
 
     def __init__(self, path: Path) -> None:
         """Read the durations; raises InputError if the file cannot be read."""
@@ -107,12 +106,12 @@ class Animation:
         try:
             with open_image(path) as file:
                 self.width, self.height = file.size
-                too_large = self.width * self.height > MOST_PIXELS
-                shown = [] if too_large else [_shown(file, index) for index in range(file.n_frames)]
+                demand_size(path, self.width, self.height)
+                shown = [_shown(file, index) for index in range(getattr(file, "n_frames", 1))]
+        except InputError:
+            raise
         except (OSError, ValueError, SyntaxError, DecompressionBombError) as error:
-            raise input_error(path, "a video", str(error).split("\n")[0], "Copy or export it again.") from None
-        if too_large:
-            raise too_many_pixels(path, self.width, self.height)
+            raise input_error(path, "a video", str(error).split("\n")[0], COPY_AGAIN) from None
         self.num_frames, self.times = len(shown), [0.0, *accumulate(shown[:-1])]
         self.seconds = self.times[-1] + shown[-1]
         self.frames_per_second = usual_rate(self.times, [])
@@ -123,7 +122,7 @@ class Animation:
                 file.seek(index)
                 yield SourceFrame(index, time, np.array(file.convert("RGB")))
 
-    def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
+    def glimpses(self, _start: float, _end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole file."""
         return [image.rgb_u8 for image in islice(self, 0, None, max(self.num_frames // count, 1))]
 
@@ -141,8 +140,6 @@ Source = ImageFolder | Video | Animation
 def open_source(path: Path, frames_per_second: float = 25.0) -> Source:
     """Open a video file or a folder of images.
 
-    Args:
-        frames_per_second: rate of a folder of images.
     Returns:
         The source. `num_frames` and `seconds` are the announced number of images and duration, 0 if unknown; `times`
         holds when each image is shown, s since the first; `notes` what is particular about it, after an iteration.

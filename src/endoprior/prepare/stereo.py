@@ -18,28 +18,20 @@ from ..priors.specular import specular_likelihood
 
 MATCHING_WIDTH = 960
 """Wider images are matched at a whole fraction of their size, px. The refinement uses the full size."""
-TOLERANCE = 0.02
-"""Relative difference up to which depths agree: about half a pixel of disparity at the usual distance."""
-SURROUNDINGS_PX = 15
-"""Side of the square around a pixel that counts as its surroundings."""
-ROUNDS = 3
-"""Gauss-Newton steps of the refinement."""
-WINDOW_SIGMA_PX = 5.0
-"""Standard deviation of the Gaussian window over which one shift is estimated."""
-NOISE_VARIANCE = 4.0
-"""Sensor noise of the gray images, levels^2: weaker gradients do not change the disparity."""
-OUTLIER_LEVELS = 6.0
-"""Brightness difference between the cameras at which a pixel has half weight."""
+TOLERANCE = 0.02  # relative difference up to which depths agree: about half a pixel of disparity at the usual distance
+SURROUNDINGS_PX = 15  # side of the square around a pixel that counts as its surroundings
+ROUNDS = 3  # Gauss-Newton steps of the refinement
+WINDOW_SIGMA_PX = 5.0  # standard deviation of the Gaussian window over which one shift is estimated
+NOISE_VARIANCE = 4.0  # sensor noise of the gray images, levels^2: weaker gradients do not change the disparity
+OUTLIER_LEVELS = 6.0  # brightness difference between the cameras at which a pixel has half weight
 MAX_CHANGE_PX = 0.5
 """Largest change by a step, and by the whole refinement; limits the damage of windows across a depth edge."""
-SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0
-"""Size and standard deviation of the smoothing window ..."""
-SMOOTHING_STEP_PX = 0.5
-"""... and the difference of disparity between neighbors on different surfaces, px."""
-SPECKLE_STEP_PX = 1.0
-"""Neighbors whose disparities differ by more belong to different regions."""
-PLANE_RESIDUAL_PX = 0.35
-"""A hole is filled if 90 % of its rim lies on a plane to within this, px of disparity."""
+SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0  # size and standard deviation of the smoothing window ...
+SMOOTHING_STEP_PX = 0.5  # ... and the difference of disparity between neighbors on different surfaces, px
+SPECKLE_STEP_PX = 1.0  # neighbors whose disparities differ by more belong to different regions
+PLANE_RESIDUAL_PX = 0.35  # a hole is filled if 90 % of its rim lies on a plane to within this, px of disparity
+
+Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -68,42 +60,25 @@ class StereoConfig:
             raise ValueError(f"far_mm must be more than near_mm, got {self.far_mm:g} and {self.near_mm:g}")
         if self.block_px % 2 == 0:
             raise ValueError(f"block_px must be odd, got {self.block_px}")
-        for name, low, high in (
-            ("block_px", 3, 15), ("left_right_px", 0.1, 10), ("speckle_px", 0, 1_000_000), ("fill_px", 0, 1_000_000),
-            ("min_confidence", 0, 1),
-        ):  # fmt: skip
-            check_range(name, getattr(self, name), low, high)
-
-
-@dataclass(frozen=True)
-class StereoDepth:
-    """Depth and confidence of the left image."""
-
-    depth: NDArray[np.float32]
-    """(H, W) z, mm; 0 where not measured."""
-    confidence: NDArray[np.float32]
-    """(H, W) in [0, 1]; 0 where not measured."""
+        check_range("block_px", self.block_px, 3, 15)
+        check_range("left_right_px", self.left_right_px, 0.1, 10)
+        check_range("speckle_px", self.speckle_px, 0, 1_000_000)
+        check_range("fill_px", self.fill_px, 0, 1_000_000)
+        check_range("min_confidence", self.min_confidence, 0, 1)
 
 
 def stereo_depth(
-    left_u8: NDArray[np.uint8],
-    right_u8: NDArray[np.uint8],
-    focal_px: float,
-    baseline_mm: float,
-    cfg: StereoConfig | None = None,
-) -> StereoDepth:
-    """Depth of every pixel of the left image that passes the left-right consistency check.
+    left_u8: Image, right_u8: Image, focal_px: float, baseline_mm: float, cfg: StereoConfig | None = None
+) -> NDArray:
+    """(H, W) depth, mm, of every pixel of the left image that passes the left-right consistency check, else 0.
 
-    Occluded pixels get no depth. Highlights move with the camera rather than with the tissue, so their confidence is
-    halved, as is that of filled holes.
+    Confidence is the product of left-right consistency, texture and absence of highlights, which move with the camera
+    rather than with the tissue.
 
     Args:
         left_u8, right_u8: (H, W, 3) rectified images, 0..255.
-        focal_px: focal length of the rectified images.
-        baseline_mm: distance between the cameras.
-    Returns:
-        depth within [near_mm, far_mm], and confidence: the product of left-right consistency, texture and absence of
-        highlights.
+        focal_px, baseline_mm: of the rectified cameras.
+        cfg: the depth is within its [near_mm, far_mm].
     Raises:
         ValueError: a depth range that is impossible for this image size.
     """
@@ -123,30 +98,21 @@ def stereo_depth(
     glint = specular_likelihood(left_u8 * np.float32(1 / 255))
     confidence = texture * np.exp(-((apart / np.float32(cfg.left_right_px)) ** 2)) * (1 - glint / 2)
     disparity[~(confidence >= cfg.min_confidence)] = np.nan
-    disparity = smooth_disparity(drop_speckles(disparity, cfg.speckle_px))
-    confidence[np.isnan(disparity)] = 0
-    disparity = fill_small_holes(disparity, cfg.fill_px)
-    filled = (confidence == 0) & np.isfinite(disparity)
-    if filled.any():
-        support = np.isfinite(disparity) & ~filled
-        confidence[filled] = _mean_around(confidence, support)[filled] / 2
+    disparity = fill_small_holes(smooth_disparity(drop_speckles(disparity, cfg.speckle_px)), cfg.fill_px)
     # This comparison also excludes NaN and disparities of the wrong sign.
     valid = (disparity >= lowest) & (disparity <= product / cfg.near_mm)
-    depth = np.divide(product, disparity, out=np.zeros_like(disparity), where=valid)
-    return StereoDepth(depth, np.where(valid, confidence, np.float32(0)))
+    return np.divide(product, disparity, out=np.zeros_like(disparity), where=valid)
 
 
-def temporal_median(window: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Temporal median filter of depth for the middle frame of a window.
+def temporal_median(window: Sequence[NDArray]) -> NDArray:
+    """(H, W) depth, mm, of the middle frame of a window after a median filter over time; 0 where missing.
 
     Frames enter in pairs, one before and one after at equal distance, and only at pixels where both agree with the
     middle frame. Steady motion therefore adds no bias, and a sudden change keeps the value of the middle frame. A hole
     is filled by the nearest pair if its two frames agree with each other and with the depth around the hole.
 
     Args:
-        window: an odd number of (H, W) depth maps, mm, 0 where missing; the middle one is filtered.
-    Returns:
-        (H, W) depth, mm; 0 where missing.
+        window: an odd number of (H, W) depth maps, mm, 0 where missing.
     """
     half = len(window) // 2
     middle = window[half]
@@ -155,7 +121,7 @@ def temporal_median(window: Sequence[NDArray[np.float32]]) -> NDArray[np.float32
     for away in range(1, half + 1):
         before, after = window[half - away], window[half + away]
         agree = np.maximum(np.abs(before - middle), np.abs(after - middle)) <= np.float32(TOLERANCE) * middle
-        # A pair of opposite infinities does not change the median.
+        # a pair of opposite infinities does not change the median.
         votes += [np.where(agree, before, -np.inf), np.where(agree, after, np.inf)]
     median = np.partition(np.stack(votes), half, axis=0)[half] if half else middle
     result = np.where(measured, median, 0).astype(np.float32)
@@ -171,8 +137,8 @@ def temporal_median(window: Sequence[NDArray[np.float32]]) -> NDArray[np.float32
 
 
 def _match_consistently(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], lowest: float, highest: float, cfg: StereoConfig
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    left: NDArray, right: NDArray, lowest: float, highest: float, cfg: StereoConfig
+) -> tuple[NDArray, NDArray]:
     """(H, W) disparity of the left image, NaN where the consistency check fails; (H, W) left-right difference, px."""
     height, width = left.shape
     times = -(-width // MATCHING_WIDTH)
@@ -184,15 +150,15 @@ def _match_consistently(
     from_left, from_right = match_both_ways(left, right, *bounds, cfg.block_px)
     apart = disagreement(from_left, from_right)
     from_left[apart > cfg.left_right_px] = np.nan
-    if times > 1:
-        from_left, apart = (
-            cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST) for values in (from_left, apart)
-        )
-        from_left = from_left * np.float32(scale)
-    return from_left, apart
+    if times == 1:
+        return from_left, apart
+    from_left, apart = (
+        cv2.resize(each, (width, height), interpolation=cv2.INTER_NEAREST) for each in (from_left, apart)
+    )
+    return from_left * np.float32(scale), apart
 
 
-def _mean_around(values: NDArray[np.float32], measured: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _mean_around(values: NDArray, measured: NDArray) -> NDArray:
     """(H, W) mean of the measured values in a square around each pixel; 0 if there are none."""
     weight = measured.astype(np.float32)
     total = cv2.blur(values * weight, (SURROUNDINGS_PX, SURROUNDINGS_PX))
@@ -200,28 +166,22 @@ def _mean_around(values: NDArray[np.float32], measured: NDArray[np.bool_]) -> ND
     return np.divide(total, share, out=np.zeros_like(total), where=share > 1e-6)
 
 
-def refine_disparity(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], disparity: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Refine each disparity by matching a Gaussian window of both images.
+def refine_disparity(left: NDArray, right: NDArray, disparity: NDArray) -> tuple[NDArray, NDArray]:
+    """Refine each disparity by matching a Gaussian window of both gray images (H, W).
 
     Semi-global matching prefers whole and half pixels ("pixel locking"). This function warps the right image onto the
     left one and estimates the remaining shift by least squares on gradients (B. Lucas and T. Kanade, IJCAI 1981, along
     rows only). It first removes smooth brightness differences; outliers get a low weight.
 
-    Args:
-        left, right: (H, W) gray.
-        disparity: (H, W) px; NaN where unknown.
     Returns:
-        (H, W) disparity, px, NaN at the same pixels; (H, W) texture in [0, 1): near 1 where gradients along rows are
-        far above the noise.
+        (H, W) disparity, px, NaN where it was; (H, W) texture in [0, 1): near 1 where gradients along rows are far
+        above the noise.
     """
     known = np.isfinite(disparity)
     trust = known.astype(np.float32)
     total = _window(trust) + np.float32(1e-6)
-    start = np.where(known, disparity, np.float32(0))
-    moved = start
-    left_gray, right_gray = left.astype(np.float32), right.astype(np.float32)
+    start = moved = np.where(known, disparity, np.float32(0))
+    texture, left_gray, right_gray = start, left.astype(np.float32), right.astype(np.float32)
     column = np.arange(left.shape[1], dtype=np.float32)[None]
     row = np.broadcast_to(np.arange(left.shape[0], dtype=np.float32)[:, None], left.shape).copy()
     for _ in range(ROUNDS):
@@ -234,11 +194,11 @@ def refine_disparity(
         step = _window(weighted * difference) / (strength + np.float32(NOISE_VARIANCE))
         step = np.clip(step, -MAX_CHANGE_PX, MAX_CHANGE_PX)
         moved = np.clip(moved - step, start - MAX_CHANGE_PX, start + MAX_CHANGE_PX)
-    texture = strength / (strength + np.float32(NOISE_VARIANCE))
+        texture = strength / (strength + np.float32(NOISE_VARIANCE))
     return np.where(known, moved, np.float32(np.nan)), texture
 
 
-def smooth_disparity(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+def smooth_disparity(disparity: NDArray) -> NDArray:
     """(H, W) `disparity` after a bilateral filter, which keeps depth edges; NaN at the same pixels."""
     known = np.isfinite(disparity)
     if not known.any():
@@ -248,7 +208,7 @@ def smooth_disparity(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(known, smooth, np.float32(np.nan))
 
 
-def drop_speckles(disparity: NDArray[np.float32], smallest_px: int) -> NDArray[np.float32]:
+def drop_speckles(disparity: NDArray, smallest_px: int) -> NDArray:
     """(H, W) `disparity` without isolated regions of fewer than `smallest_px` pixels."""
     unknown = -(2**15)
     sixteenths = np.where(np.isfinite(disparity), np.rint(disparity * 16), unknown).astype(np.int16)
@@ -256,15 +216,10 @@ def drop_speckles(disparity: NDArray[np.float32], smallest_px: int) -> NDArray[n
     return np.where(sixteenths == unknown, np.float32(np.nan), disparity)
 
 
-def fill_small_holes(disparity: NDArray[np.float32], largest_px: int) -> NDArray[np.float32]:
-    """Fill holes of at most `largest_px` pixels whose rim lies on a plane; leave all others.
+def fill_small_holes(disparity: NDArray, largest_px: int) -> NDArray:
+    """(H, W) disparity whose holes (NaN) of at most `largest_px` pixels with a rim on a plane are filled.
 
     Holes at depth edges and at the image border stay. A plane in space is also a plane in disparity.
-
-    Args:
-        disparity: (H, W) px; NaN where unknown.
-    Returns:
-        (H, W) disparity, px.
     """
     filled = disparity.copy()
     missing = np.isnan(disparity).astype(np.uint8)
@@ -275,8 +230,7 @@ def fill_small_holes(disparity: NDArray[np.float32], largest_px: int) -> NDArray
         if area > largest_px or x == 0 or y == 0 or x + w == width or y + h == height:
             continue
         part = np.s_[max(y - 2, 0) : y + h + 2, max(x - 2, 0) : x + w + 2]
-        hole = labels[part] == label
-        around = disparity[part]
+        hole, around = labels[part] == label, disparity[part]
         rim = (cv2.dilate(hole.astype(np.uint8), square) > 0) & np.isfinite(around)
         plane = _plane(rim, around[rim])
         if plane is not None:
@@ -284,7 +238,7 @@ def fill_small_holes(disparity: NDArray[np.float32], largest_px: int) -> NDArray
     return filled
 
 
-def _plane(rim: NDArray[np.bool_], values: NDArray[np.float32]) -> NDArray[np.float64] | None:
+def _plane(rim: NDArray, values: NDArray) -> NDArray | None:
     """(3,) the plane through `values` at the pixels of `rim`; None if the residual is too large."""
     if values.size < 8:
         return None
@@ -294,12 +248,11 @@ def _plane(rim: NDArray[np.bool_], values: NDArray[np.float32]) -> NDArray[np.fl
     return plane if rank == 3 and smooth else None
 
 
-def _coordinates(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _coordinates(mask: NDArray) -> NDArray:
     """(n, 3) column, row and 1 of the pixels of `mask`."""
     rows, columns = np.nonzero(mask)
     return np.column_stack([columns, rows, np.ones(rows.size)]).astype(np.float64)
 
 
-def _window(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) Gaussian mean."""
+def _window(values: NDArray) -> NDArray:
     return cv2.GaussianBlur(values, (0, 0), WINDOW_SIGMA_PX)

@@ -20,32 +20,22 @@ from ..core.ranges import spread
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
 
-COMPARED = 24
-"""Number of frames that are compared with a later one."""
+COMPARED = 24  # number of frames that are compared with a later one
 SIDE_PX = 160
-RETURN_PX, RETURN_SHARE = 0.7, 0.1
-"""Forward and backward flow agree if they differ by at most this, px, plus this share of the step."""
-LEAST_AGREEING = 0.8
-"""Share of the tissue where they must agree. Where haze or darkness leaves less to follow, nothing can be said."""
+RETURN_PX, RETURN_SHARE = 0.7, 0.1  # flow forward and back may differ by this, px, plus this share of the step ...
+LEAST_AGREEING = 0.8  # ... on this share of the tissue. Where haze or darkness leaves less, nothing can be said.
+# Least difference from the background motion, px, and as a multiple of that of the median pixel. At 1.5 and 5, frames
+# without tools are named in fetoscopy and colonoscopy.
 LEAST_PX, TIMES_MEDIAN = 2.0, 8.0
-"""Least difference from the background motion, px, and as a multiple of that of the median pixel. At 1.5 and 5, frames
-without tools are named in fetoscopy and colonoscopy."""
-NEAR_TOOL_PX = 8
-"""Motion this near to a mask is that of its tool, or of tissue that it pulls."""
-LEAST_SHARE = 0.01
-"""Smaller regions, as a share of the view, are not reported."""
+NEAR_TOOL_PX = 8  # motion this near to a mask is that of its tool, or of tissue that it pulls
+LEAST_SHARE = 0.01  # smaller regions, as a share of the view, are not reported
 SMOOTH_PX = 2.0
-ROUNDS, EVERY = 8, 7
-"""Rounds of the robust fit; every so many pixels take part in it."""
-Mask = NDArray[np.bool_]
+ROUNDS, EVERY = 8, 7  # rounds of the robust fit; every so many pixels take part in it
+Image, Mask = NDArray[np.uint8], NDArray[np.bool_]
 
 
 def frames_with_unmasked_motion(
-    count: int,
-    frames_per_second: float,
-    color: Callable[[int], NDArray[np.uint8]],
-    tool: Callable[[int], Mask],
-    view: Mask,
+    count: int, frames_per_second: float, color: Callable[[int], Image], tool: Callable[[int], Mask], view: Mask
 ) -> list[int]:
     """Of a few frames, spread over a sequence of `count`, those of `moves_unmasked`.
 
@@ -59,7 +49,7 @@ def frames_with_unmasked_motion(
     return [i for i in compared if moves_unmasked(color(i), color(i + ahead), view, (tool(i) | tool(i + ahead)) & view)]
 
 
-def moves_unmasked(first: NDArray[np.uint8], later: NDArray[np.uint8], view: Mask, tool: Mask) -> bool:
+def moves_unmasked(first: Image, later: Image, view: Mask, tool: Mask) -> bool:
     """Whether something enters the view of the first frame, moves against its surroundings, and is not masked.
 
     Args:
@@ -81,22 +71,20 @@ def moves_unmasked(first: NDArray[np.uint8], later: NDArray[np.uint8], view: Mas
     most = max(TIMES_MEDIAN * usual, LEAST_PX)
     near = cv2.dilate(tool.astype(np.uint8), disk(NEAR_TOOL_PX)) > 0
     moving = (cv2.GaussianBlur(difference, (0, 0), SMOOTH_PX) > most) & view & ~near
-    moving = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, disk(3))
+    moving = np.asarray(cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, disk(3)), np.uint8)
     return bool(entering_regions(moving, view).sum() > LEAST_SHARE * view.sum())
 
 
 def difference_from_background(flow: NDArray[np.float32], background: Mask) -> tuple[NDArray[np.float32], float]:
-    """(h, w) px by which flow differs from a smooth motion that explains most of the background; and the median there.
+    """(h, w) px by which flow (h, w, 2) differs from a smooth motion that explains most of the background (h, w).
 
-    Args:
-        flow: (h, w, 2) px.
-        background: (h, w) True where tissue is seen.
+    The second value is the median there.
     """
     height, width = background.shape
     y, x = (each.ravel() for each in np.mgrid[:height, :width] / np.array([height, width])[:, None, None] - 0.5)
     terms, moved = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1), flow.reshape(-1, 2)
     some = np.flatnonzero(background)[::EVERY]
-    weight = np.ones(len(some))
+    weight, left, coefficients = np.ones(len(some)), np.zeros(len(some)), np.zeros((terms.shape[1], 2))
     for _ in range(ROUNDS):
         weighted = terms[some] * weight[:, None]
         normal = weighted.T @ terms[some] + 1e-6 * np.eye(terms.shape[1])

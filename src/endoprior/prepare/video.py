@@ -13,53 +13,46 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.container import InputContainer
+from av.error import ArgumentError, FFmpegError
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.shell import quoted
 from ..data.reading import MOST_PIXELS
 from ..data.video_files import open_container, starts_of_parts, what_it_is
-from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, is_cover, packet_times, usual_rate
+from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, in_seconds, is_cover, packet_times, usual_rate
+
+LOST_SHARE, LOST_IMAGES = 0.02, 2  # truncated: more of the duration, and more images, are missing at the end
+STATES_END = ("matroska,webm", "nut")
+"""FFmpeg's names of the formats whose duration is the time of the end, however late the first image is shown."""
+ARBITRARY_CLOCKS = ("mpegts", "mpeg")  # formats whose times do not count from the start of the recording
+PIXEL_ASPECTS = (0.25, 4.0)  # plausible width of a pixel, in heights
+LOOKED_AT = 300  # most images that are decoded to reach the time of a glimpse: as many as between two key frames
+COPY_AGAIN = "Copy or export it again."
 
 
 @dataclass(frozen=True)
 class SourceFrame:
     """One image of a source."""
 
-    index: int
-    """Position in the source, from 0."""
-    seconds: float
-    """Time since the first image. It may be before that of the image before, if the file has its times in disorder."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3) of square pixels."""
-    damaged: bool = False
-    """Bytes of it, or of an image that it was predicted from, are missing or wrong."""
-
-
-LOST_SHARE, LOST_IMAGES = 0.02, 2
-"""A video is truncated if more than this share of its duration and more than so many images are missing at its end."""
-STATES_END = ("matroska,webm", "nut")
-"""FFmpeg's names of the formats whose duration is the time of the end, however late the first image is shown."""
-ARBITRARY_CLOCKS = ("mpegts", "mpeg")
-"""FFmpeg's names of the formats whose times do not count from the start of the recording."""
-PIXEL_ASPECTS = (0.25, 4.0)
-"""Plausible width of a pixel, in heights."""
-LOOKED_AT = 300
-"""Most images that are decoded to reach the time of a glimpse: as many as between two key frames."""
+    index: int  # position in the source, from 0
+    seconds: float  # since the first image; may be before that of the image before, if the file is in disorder
+    rgb_u8: NDArray[np.uint8]  # (H, W, 3) of square pixels
+    damaged: bool = False  # bytes of it, or of an image that it was predicted from, are missing or wrong
 
 
 class Video:
     """A video file. Metadata (names, dates, places) is not read."""
 
-    weave: bool = False
-    """Keep the rows of interlaced images as they are: they are those of two cameras."""
-    was_damaged: bool = False
-    """Whether an iteration has met damage. From then on, one thread decodes: it reports all damage."""
+    weave: bool = False  # keep the rows of interlaced images as they are: they are those of two cameras
+    was_damaged: bool = False  # an iteration has met damage: from then on, one thread decodes, which reports all damage
 
     def __init__(self, path: Path) -> None:
         """Open the file and decode the first image; raises InputError if that fails."""
-        self.path = path
-        self._size: tuple[int, int] | None = None
+        self.path, self.start = path, 0.0
+        self._size = (0, 0)
         self._found: list[str] = []
         if path.stat().st_size == 0:
             raise input_error(path, "a video file", "an empty file", "Copy it again.")
@@ -68,23 +61,21 @@ class Video:
             packets, end = packet_times(container, track)
             self.frames_per_second = usual_rate([time for time in packets if time is not None], stated)
             self._step = 1 / self.frames_per_second
-            along = Timeline(self._step).along((None, time) for time in packets)
-            times = [time for _, time in along]
-            self.times: list[float] = sorted(time - times[0] for time in times) if times else []
+            times = [time for _, time in Timeline(self._step).along((None, time) for time in packets)]
+            self.times = sorted(time - times[0] for time in times)
             """Time of each image since the first one, s, before any is decoded."""
             self.num_frames = max(int(track.frames), 0)
             aspect = track.sample_aspect_ratio or Fraction(1)
             self._aspect = aspect if PIXEL_ASPECTS[0] <= aspect <= PIXEL_ASPECTS[1] else Fraction(0)
             unread = _unread_parts(path, container.format.name, end)
-            self._unused = [*_other_tracks(container, track), *unread]
+            self._unused = [*_other_tracks(path.absolute(), container, track), *unread]
             # The duration may be that of all parts.
             self._announced_end = 0.0 if unread else _announced_end(container, track)
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
-        self.start = 0.0
         first = next(iter(self), None)
         if first is None:
             want = f"a video with images of at most {MOST_PIXELS // 1_000_000} Mpx"
-            raise input_error(path, want, "none that can be decoded", "Copy or export it again.")
+            raise input_error(path, want, "none that can be decoded", COPY_AGAIN)
         self.height, self.width = first.rgb_u8.shape[:2]
         lasts = max(self._announced_end - self.start, 0.0)
         self.seconds = max(lasts, self.times[-1] + self._step if self.times else 0.0)
@@ -103,27 +94,28 @@ class Video:
     @property
     def notes(self) -> list[str]:
         """What is particular about the file, one line each; of its images after a complete iteration."""
-        name, notes = self.path.name, list(self._unused)
+        notes, (width, height) = list(self._unused), self._size
         if self.pixel_aspect != 1:
-            width, height = self._size
-            aspect = f"{self._aspect.numerator}:{self._aspect.denominator}"
-            stored, shown = f"{width}x{height}", f"{self._shown_width(width)}x{height}"
-            notes.append(f"{name}: pixels are not square ({aspect}); {stored} px become {shown} px")
+            aspect, shown = f"{self._aspect.numerator}:{self._aspect.denominator}", self._shown_width(width)
+            notes.append(
+                self._note(f"pixels are not square ({aspect}); {width}x{height} px become {shown}x{height} px")
+            )
         elif self._aspect == 0:
-            notes.append(f"{name}: the stated aspect ratio of pixels is not plausible and is ignored")
+            notes.append(self._note("the stated aspect ratio of pixels is not plausible and is ignored"))
         return notes + self._found
 
+    def _note(self, words: str) -> str:
+        return f"{self.path.name}: {words}"
+
     def __iter__(self) -> Iterator[SourceFrame]:
-        timeline, lost = Timeline(self._step), []
+        timeline, lost, broken = Timeline(self._step), [], ""
         began, last, shown_until = None, 0.0, 0.0
         index = interlaced = 0
-        broken = ""
         with self._open() as (container, track):
             try:
                 images = decode(container, track, lost, one_thread=self.was_damaged, weave=self.weave)
                 for image, seconds in timeline.along((image, image.seconds) for image in images):
-                    began = seconds if began is None else began
-                    self.start = began
+                    began = self.start = seconds if began is None else began
                     last = max(last, seconds)
                     own = float((image.frame.duration or 0) * (image.frame.time_base or 0))
                     shown_until = max(shown_until, seconds + max(self._step, own))
@@ -131,51 +123,61 @@ class Video:
                     self.was_damaged |= image.damaged
                     yield SourceFrame(index, seconds - began, self._rgb(image, index), image.damaged)
                     index += 1
-            except av.error.FFmpegError as error:
+            except FFmpegError as error:
                 broken = error.strerror or str(error)
         self.was_damaged |= bool(lost)
         nothing_decodes = bool(self.times) and not index
         self._found = [] if nothing_decodes else self._check_end(index, began or 0.0, last, shown_until, broken)
-        self._found += self._oddities(timeline, len(lost), interlaced)
+        parts, is_filled = f"{timeline.restarts + 1} parts", interlaced and not self.weave
+        particular = {
+            f"damaged images that cannot be decoded and are left out: {len(lost)}": lost,
+            f"joined of {parts}, each with times of its own; they follow each other": timeline.restarts,
+            f"times in disorder, images that are shown too late: {timeline.misplaced}": timeline.misplaced,
+            f"{interlaced} images are interlaced; one field of each is used, with its rows filled": is_filled,
+        }
+        self._found += [self._note(words) for words, is_so in particular.items() if is_so]
 
     def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole time range, with all their rows; at least one."""
         end = min(end, self.seconds)
         wanted = [start + (i + 0.5) / count * max(end - start, 0.0) for i in range(count)]
-        if len(self.times) > LOOKED_AT:
-            with self._open() as (container, track):
-                found = [self._glimpse(container, track, time) for time in wanted]
-            if any(image is not None for image in found):
-                return [image for image in found if image is not None]
         with self._open() as (container, track):
-            images = decode(container, track, [], weave=True)
-            positions = {bisect_left(self.times, time) for time in wanted} if self.times else {0}
-            positions = {min(position, LOOKED_AT - 1) for position in positions} | {0}
-            return [
-                self._rgb(image, index) for index, image in enumerate(islice(images, LOOKED_AT)) if index in positions
-            ]
+            if len(self.times) > LOOKED_AT:
+                glimpses = (self._glimpse(container, track, time) for time in wanted)
+                if found := [image for image in glimpses if image is not None]:
+                    return found
+        with self._open() as (container, track):
+            images = islice(decode(container, track, [], weave=True), LOOKED_AT)
+            positions = {min(bisect_left(self.times, time), LOOKED_AT - 1) for time in wanted if self.times} | {0}
+            return [self._rgb(image, index) for index, image in enumerate(images) if index in positions]
 
-    def _glimpse(self, container: av.container.InputContainer, track: av.VideoStream, time: float) -> NDArray | None:
+    def _glimpse(self, container: InputContainer, track: VideoStream, time: float) -> NDArray[np.uint8] | None:
         """The image at a time since the first one; None if the file cannot be searched."""
         at, image = time + self.start, None
         try:
-            container.seek(int(at / track.time_base), stream=track)
+            container.seek(int(at / (track.time_base or 1)), stream=track)
             for image in islice(decode(container, track, [], weave=True), LOOKED_AT):
                 if image.seconds is None or image.seconds >= at - self._step / 2:
                     break
-        except av.error.FFmpegError:
+        except FFmpegError:
             pass
         return None if image is None else self._rgb(image, 0)
 
     def _rgb(self, image: DecodedImage, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) upright image of square pixels."""
+        """(H, W, 3) upright image of square pixels; InputError if too large, or of another size than the first."""
         width, height = image.frame.width, image.frame.height
-        self._demand_size(width, height, index)
+        shown = self._shown_width(width)
+        demand_size(self.path, max(width, shown), height)
+        if self._size == (0, 0):
+            self._size = (width, height)
+        if (width, height) != self._size:
+            want, got = "{}x{} px as in the first image".format(*self._size), f"{width}x{height} in image {index}"
+            raise input_error(self.path, want, got, "Cut the video there, or export it at one size.")
         rgb_u8 = image.frame.to_ndarray(format="rgb24")
-        if (shown := self._shown_width(width)) != width:
+        if shown != width:
             how = cv2.INTER_CUBIC if shown > width else cv2.INTER_AREA
             rgb_u8 = cv2.resize(rgb_u8, (shown, height), interpolation=how)
-        return np.ascontiguousarray(np.rot90(rgb_u8, image.turns))
+        return np.ascontiguousarray(np.rot90(rgb_u8, image.turns), np.uint8)
 
     def _shown_width(self, width: int) -> int:
         """Width of an image of square pixels. It is even, so that the halves of a stereo image stay halves."""
@@ -194,15 +196,12 @@ class Video:
             broken: message of the decoder if it could not go on.
         """
         step, duration = self._step, self._announced_end - began
-        missing = self._announced_end - shown_until
-        known = self._announced_end > 0
+        missing, known = self._announced_end - shown_until, self._announced_end > 0
         if (broken and not known) or missing > max(LOST_SHARE * duration, LOST_IMAGES * step):
-            raise input_error(
-                self.path,
-                f"{duration / step if known else self.num_frames:.0f} images",
-                f"{count}, then {broken or 'the end: the file is truncated'}",
-                f"Copy it again, or use its first part with `--end {last - began:.2f}`.",
-            )
+            want = f"{duration / step if known else self.num_frames:.0f} images"
+            got = f"{count}, then {broken or 'the end: the file is truncated'}"
+            fix = f"Copy it again, or use its first part with `--end {last - began:.2f}`."
+            raise input_error(self.path, want, got, fix)
         ends_early = missing > 0.75 * step
         if not (ends_early or broken or self.num_frames not in (0, count)):
             return []
@@ -210,65 +209,41 @@ class Video:
         announced = self.num_frames or round(duration / step)
         return [f"{self.path.name} announces {announced} images, {count} can be decoded{end}"]
 
-    def _oddities(self, timeline: Timeline, lost: int, interlaced: int) -> list[str]:
-        """Notes about what a complete iteration has met."""
-        name, notes = self.path.name, []
-        if lost:
-            notes.append(f"{name}: damaged images that cannot be decoded and are left out: {lost}")
-        if timeline.restarts:
-            parts = f"{timeline.restarts + 1} parts, each with times of its own"
-            notes.append(f"{name}: joined of {parts}; they follow each other")
-        if timeline.misplaced:
-            notes.append(f"{name}: times in disorder, images that are shown too late: {timeline.misplaced}")
-        if interlaced and not self.weave:
-            notes.append(f"{name}: {interlaced} images are interlaced; one field of each is used, with its rows filled")
-        return notes
-
-    def _demand_size(self, width: int, height: int, index: int) -> None:
-        """Reject images that are too large, and a size that changes within the video."""
-        if max(width, self._shown_width(width)) * height > MOST_PIXELS:
-            raise too_many_pixels(self.path, max(width, self._shown_width(width)), height)
-        self._size = self._size or (width, height)
-        if (width, height) != self._size:
-            want, got = "{}x{} px as in the first image".format(*self._size), f"{width}x{height} in image {index}"
-            raise input_error(self.path, want, got, "Cut the video there, or export it at one size.")
-
     @contextmanager
-    def _open(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
         try:
             container = open_container(self.path)
-        except (av.error.FFmpegError, OSError, UnicodeError) as error:
+        except (FFmpegError, OSError, UnicodeError) as error:
             # FFmpeg raises ArgumentError for a format that is not in the list.
-            unlisted = isinstance(error, av.error.ArgumentError)
-            got = "a file of another kind" if unlisted else getattr(error, "strerror", None) or str(error)
-            got = what_it_is(self.path) or got
-            hint = "Pass a folder with one file for each image." if got == "one image" else "Copy or export it again."
-            raise input_error(self.path, "a video file", got, hint) from None
+            unlisted = isinstance(error, ArgumentError)
+            reason = "a file of another kind" if unlisted else getattr(error, "strerror", None) or str(error)
+            got = what_it_is(self.path) or reason
+            fix = "Pass a folder with one file for each image." if got == "one image" else COPY_AGAIN
+            raise input_error(self.path, "a video file", got, fix) from None
         with container:
             track = choose_track(container)
             if track is None:
                 got = "images in an unknown format" if container.streams.video else "a file without images"
                 raise input_error(self.path, "a video", got, "Check the path, or export it as H.264.")
-            width, height = track.codec_context.width, track.codec_context.height
-            if width * height > MOST_PIXELS:
-                raise too_many_pixels(self.path, width, height)
+            demand_size(self.path, track.codec_context.width, track.codec_context.height)
             # The size may change later, and that which the container states may be wrong.
             track.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
             yield container, track
 
 
-def too_many_pixels(path: Path, width: int, height: int) -> InputError:
-    """The error for a video of too large images."""
-    want = f"images of at most {MOST_PIXELS // 1_000_000} Mpx"
-    return input_error(path, want, f"{width}x{height}", "Export the video at a smaller size.")
+def demand_size(path: Path, width: int, height: int) -> None:
+    """Raise InputError if the images of a video are too large."""
+    if width * height > MOST_PIXELS:
+        want = f"images of at most {MOST_PIXELS // 1_000_000} Mpx"
+        raise input_error(path, want, f"{width}x{height}", "Export the video at a smaller size.")
 
 
-def _announced_end(container: av.container.InputContainer, track: av.VideoStream) -> float:
+def _announced_end(container: InputContainer, track: VideoStream) -> float:
     """Time at which the last image of a complete file ends, s; 0 if unknown."""
     if container.format.name == AVI and track.frames:  # FFmpeg shortens the duration of a truncated file
-        return float(track.frames * track.time_base)
+        return in_seconds(track, track.frames)
     if track.duration is not None:
-        return float(((track.start_time or 0) + track.duration) * track.time_base)
+        return in_seconds(track, (track.start_time or 0) + track.duration)
     # The duration of the file equals that of the images only if there is no other stream.
     if len(container.streams) == 1 and container.duration is not None:
         start = 0 if container.format.name in STATES_END else container.start_time or 0
@@ -286,25 +261,20 @@ def _unread_parts(path: Path, format_name: str, end: int) -> list[str]:
     return [f"{path.name}: of {len(starts)} joined files only {first} used; join them with `ffmpeg -f concat`"]
 
 
-def _size(track: av.VideoStream) -> tuple[int, int] | None:
-    """(width, height), px; None if its format is unknown."""
-    return (track.codec_context.width, track.codec_context.height) if track.codec_context else None
-
-
-def _other_tracks(container: av.container.InputContainer, used: av.VideoStream) -> list[str]:
+def _other_tracks(path: Path, container: InputContainer, used: VideoStream) -> list[str]:
     """A note if there are other tracks of images than the one that is used."""
     others = [track for track in container.streams.video if track.index != used.index and not is_cover(track)]
     if not others:
         return []
 
-    def words(track: av.VideoStream) -> str:
-        size = "{}x{} px".format(*_size(track)) if track.codec_context else "of an unknown format"
-        return f"{size}{f', {track.frames} images' if track.frames else ''}"
+    def size(track: VideoStream) -> str:
+        known = track.codec_context
+        return f"{known.width}x{known.height} px" if known else "of an unknown format"
 
-    left_out = "; ".join(map(words, others))
-    path = Path(container.name.removeprefix("file:"))
-    notes = [f"{path.name}: of {len(others) + 1} video tracks, only one is used ({words(used)}), not: {left_out}"]
-    if equal := [track for track in others if _size(track) == _size(used)]:
+    shown = [f"{size(each)}{f', {each.frames} images' if each.frames else ''}" for each in (used, *others)]
+    left_out = "; ".join(shown[1:])
+    notes = [f"{path.name}: of {len(others) + 1} video tracks, only one is used ({shown[0]}), not: {left_out}"]
+    if equal := [track for track in others if size(track) == size(used)]:
         second = path.with_name(f"{path.stem}_right{path.suffix}")
         words = ["ffmpeg", "-i", path, "-map", f"0:{equal[0].index}", "-c", "copy", second]
         split = " ".join(map(quoted, words))

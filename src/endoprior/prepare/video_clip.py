@@ -1,39 +1,44 @@
-"""A clip of one or two cameras: its video files, how the images of both cameras are stored, and the frames to use."""
+"""A clip of one or two cameras: its video files, how the images of both cameras are stored, and the frames to use.
+
+For a video of variable frame rate, each step of an even time grid takes the image that was on screen at that time. No
+image is used twice: where the source has a gap, the grid step is left out and counted. Images between two steps are
+left out and counted, too. Images of two cameras are paired by time, or by the names of their files.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..data.frame_files import match_names
 from .calibration import Calibration
 from .config import Layout, PrepareConfig
 from .frame_geometry import MIN_SIDE_PX
-from .frame_selection import FrameSelection, Pairing, find_pairing
-from .source import Source, open_source
+from .source import ImageFolder, Source, open_source
 from .video import SourceFrame, Video
 
-KINDS: tuple[Layout, ...] = ("side-by-side", "top-bottom", "interlaced")
-"""How one frame can hold two images."""
-LOOK_ALIKE = 0.8
-"""Correlation above which the halves of a frame are two views of the same scene."""
-GLIMPSES = 9
-"""Number of images that tell the stereo layout."""
-CONTENT = 3.0
-"""Least standard deviation, levels of 255, of a frame that shows something, in each of its rows and columns."""
+KINDS: tuple[Layout, ...] = ("side-by-side", "top-bottom", "interlaced")  # how one frame can hold two images
+LOOK_ALIKE = 0.8  # correlation above which the halves of a frame are two views of the same scene
+GLIMPSES = 9  # number of images that tell the stereo layout
+CONTENT = 3.0  # least standard deviation, levels, of a frame that shows something, in each of its rows and columns
+EVEN = 0.25  # a time step that differs from the nominal one by more than this share is uneven
+SAME_CLOCK_S = 1.0  # arbitrary clocks are one clock if they start closer together than this
+Image = NDArray[np.uint8]
 
 
-def split_cameras(frame: NDArray[np.uint8], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+def split_cameras(frame: Image, layout: Layout) -> tuple[Image, Image | None]:
     """Images of the first and second camera; the second is None for `mono` and `two-files`.
 
     Args:
-        frame: (H, W, 3).
-        layout: not `auto`. An interlaced frame holds the cameras in its even and odd rows. Both images come back with H
+        frame: (H, W, 3). An interlaced one holds the cameras in its even and odd rows. Both images come back with H
             rows, missing rows interpolated, so that rows keep their true heights.
     """
     height, width = frame.shape[:2]
@@ -46,7 +51,7 @@ def split_cameras(frame: NDArray[np.uint8], layout: Layout) -> tuple[NDArray[np.
     return frame, None
 
 
-def _fill_rows(frame: NDArray[np.uint8], parity: int) -> NDArray[np.uint8]:
+def _fill_rows(frame: Image, parity: int) -> Image:
     """(H, W, 3) with the rows of the other parity replaced by the mean of their neighbors."""
     filled, own = frame.copy(), frame[parity::2].astype(np.uint16)
     filled[parity + 1 : parity + 2 * len(own) - 1 : 2] = (own[:-1] + own[1:] + 1) // 2
@@ -59,14 +64,10 @@ def _fill_rows(frame: NDArray[np.uint8], parity: int) -> NDArray[np.uint8]:
 
 def camera_size(width: int, height: int, layout: Layout) -> tuple[int, int]:
     """(width, height) of one camera's image, px."""
-    if layout == "side-by-side":
-        return width // 2, height
-    return (width, height // 2) if layout == "top-bottom" else (width, height)
+    return width // (1 + (layout == "side-by-side")), height // (1 + (layout == "top-bottom"))
 
 
-def find_layout(
-    frames: Sequence[NDArray[np.uint8]], calibration: Calibration | None, has_second_source: bool, name: str
-) -> Layout:
+def find_layout(frames: Sequence[Image], calibration: Calibration | None, has_second_source: bool, name: str) -> Layout:
     """Detect the layout from the image size of the calibration and from the content of a few frames.
 
     Args:
@@ -78,67 +79,193 @@ def find_layout(
     """
     if has_second_source:
         return "two-files"
-    height, width = frames[0].shape[:2]
     telling = [frame for frame in frames if _shows_something(frame)]
-    stereo = calibration is not None and calibration.right is not None
-    alike = [kind for kind in KINDS if sum(_alike(frame, kind) for frame in telling) > len(telling) / 2]
-    if not stereo:
+    alike: list[Layout] = [kind for kind in KINDS if sum(_alike(frame, kind) for frame in telling) > len(telling) / 2]
+    if calibration is None or calibration.right is None:
         if alike and alike[0] != "interlaced":
-            hint = f"`--calibration FILE --layout {alike[0]}`, or `--layout mono` if there is one camera."
-            raise input_error(name, "a calibration for a stereo video", f"none, and a {alike[0]} frame", hint)
+            fix = f"`--calibration FILE --layout {alike[0]}`, or `--layout mono` if there is one camera."
+            raise input_error(name, "a calibration for a stereo video", f"none, and a {alike[0]} frame", fix)
         return "mono"
-    stated = calibration.layout or ""
-    for kind in KINDS:
-        if kind in stated.lower():
-            return kind
-    if calibration.size:
-        across, down = width / calibration.size[0], height / calibration.size[1]
-        if abs(across / down - 2) < 0.02:
-            return "side-by-side"
-        if abs(across / down - 0.5) < 0.005:
-            return "top-bottom"
-        if abs(across / down - 1) < 0.01 and "interlaced" in alike:
-            return "interlaced"
-    if alike:
-        return alike[0]
-    hint = "`--layout side-by-side`, `top-bottom` or `interlaced`, or `--right VIDEO` for a second video."
-    raise input_error(name, "two cameras in each frame", f"{width}x{height} px without a known layout", hint)
+    height, width = frames[0].shape[:2]
+    stated: list[Layout] = [kind for kind in KINDS if kind in (calibration.layout or "").lower()]
+    found: list[Layout] = [*stated, *_by_size(width, height, calibration, alike), *alike]
+    if found:
+        return found[0]
+    fix = "`--layout side-by-side`, `top-bottom` or `interlaced`, or `--right VIDEO` for a second video."
+    raise input_error(name, "two cameras in each frame", f"{width}x{height} px without a known layout", fix)
 
 
-def _shows_something(frame: NDArray[np.uint8]) -> bool:
+def _by_size(width: int, height: int, calibration: Calibration, alike: list[Layout]) -> list[Layout]:
+    """The layout whose frame holds two images of the calibrated shape."""
+    if not calibration.size:
+        return []
+    aspect = width / calibration.size[0] / (height / calibration.size[1])
+    fits = abs(aspect - 2) < 0.02, abs(aspect - 0.5) < 0.005, abs(aspect - 1) < 0.01 and "interlaced" in alike
+    return [kind for kind, fit in zip(KINDS, fits, strict=True) if fit]
+
+
+def _shows_something(frame: Image) -> bool:
     """Whether a frame varies within its rows and within its columns, unlike a black one or color bars."""
-    gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
-    small = cv2.resize(gray, (96, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = _small(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY))
     return bool(min(np.median(small.std(0)), np.median(small.std(1))) > CONTENT)
 
 
-def _alike(frame: NDArray[np.uint8], layout: Layout) -> bool:
+def _alike(frame: Image, layout: Layout) -> bool:
     """Whether both halves show nearly the same image, up to a shift along x."""
-    gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+    gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
     if layout == "interlaced":
         rows = gray[: len(gray) // 2 * 2].astype(np.float32)
         # Rows of one camera are more similar to each other than to the rows of the other camera.
         own, other = np.abs(rows[2:] - rows[:-2]).mean(), np.abs(rows[1:] - rows[:-1]).mean()
         return bool(other > 1.2 * own)
-    first, second = (
-        cv2.resize(np.ascontiguousarray(half), (96, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
-        for half in split_cameras(gray[..., None], layout)
-    )
+    first, second = (_small(half) for half in split_cameras(gray[..., None], layout) if half is not None)
     return bool(cv2.matchTemplate(second, first[:, 16:-16], cv2.TM_CCOEFF_NORMED).max() > LOOK_ALIKE)
+
+
+def _small(gray: NDArray) -> NDArray:
+    return cv2.resize(np.ascontiguousarray(gray), (96, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+class Moment(NamedTuple):
+    """Place and time of an image."""
+
+    index: int
+    seconds: float
+
+
+Item = TypeVar("Item", Moment, "StereoFrame", SourceFrame)
+
+
+@dataclass
+class FrameSelection:
+    """A time grid, and counts of gaps and uneven steps. Iterating over `pick` fills the counts."""
+
+    frames_per_second: float  # rate of the grid
+    start: float = 0.0  # seconds
+    end: float = math.inf  # seconds; images at or after it are not used
+    source_rate: float = 0.0  # nominal rate of the source, 1/s; half of its time step is the tolerance. 0 if unknown.
+    only: frozenset[int] | None = None  # positions in the source of the images to use, of those on the grid; None: all
+    taken: int = field(default=0, init=False)
+    gaps: int = field(default=0, init=False)  # grid steps without an image
+    uneven_steps: int = field(default=0, init=False)  # time steps of the source that differ from the nominal one
+    between: int = field(default=0, init=False)  # images within the time range that are not used
+
+    def pick(self, images: Iterable[Item]) -> Iterator[Item]:
+        """The images on the grid, in order; stops at `end`."""
+        step = 1 / self.frames_per_second
+        nominal = 1 / self.source_rate if self.source_rate else step
+        tolerance = 0.5 * min(step, nominal)
+        self.taken = self.gaps = self.uneven_steps = self.between = 0
+        slot, before = 0, None
+        for image in images:
+            if image.seconds >= self.end - 1e-9:
+                return
+            self.uneven_steps += before is not None and abs(image.seconds - before - nominal) > EVEN * nominal
+            before = image.seconds
+            if image.seconds < self.start + slot * step - tolerance:
+                self.between += image.seconds >= self.start - tolerance
+                continue
+            reached = max(math.floor((image.seconds - self.start + tolerance) / step + 1e-9), slot)
+            self.gaps += reached - slot if self.taken else 0
+            slot = reached + 1
+            self.taken += 1
+            if self.only is None or image.index in self.only:
+                yield image
+
+
+class Pairing:
+    """How the images of two sources are paired: those of folders by name, others by time."""
+
+    def __init__(self, first: Source, second: Source) -> None:
+        self._first, self._second = first, second
+        self._offset = 0.0  # time of the first image of the second source, s since that of the first source
+        self._by_name: dict[int, int] = {}  # position in the second folder for a position in the first one
+        self.rate = min(first.frames_per_second, second.frames_per_second)
+        if isinstance(first, ImageFolder) and isinstance(second, ImageFolder):
+            names = [file.name for file in second.files], [file.stem for file in first.files]
+            matched = match_names(second.path, names[0], range(len(names[1])), names[1], required=())
+            self._by_name, unused = matched.files, len(names[0]) - len(matched.files)
+            notes = [matched.rule] if "in order" in matched.rule else []
+            notes += [f"{unused} images have none of the first camera and are left out"] if unused else []
+        else:
+            self._offset, notes = _offset(first, second)
+        self.note = f"{second.path.name}: {'; '.join(notes)}" if notes else ""  # what is particular, or empty
+
+    def __iter__(self) -> Iterator[tuple[SourceFrame, SourceFrame | None]]:
+        """Each image of the first source, with that of the second source at the same time, if there is one."""
+        first, second = self._first, self._second
+        if isinstance(first, ImageFolder) and isinstance(second, ImageFolder):
+            for image in first:
+                other = self._by_name.get(image.index)
+                yield image, None if other is None else second.image(other)
+        else:
+            tolerance = 0.5 * min(1 / first.frames_per_second, 1 / second.frames_per_second)
+            yield from pair_by_time(first, second, self._offset, tolerance)
+
+
+def _offset(first: Source, second: Source) -> tuple[float, list[str]]:
+    """Time of the first image of the second source, s since that of the first source; and what is particular."""
+    offset, notes = second.start - first.start, []
+    if (first.clock_is_arbitrary or second.clock_is_arbitrary) and abs(offset) > SAME_CLOCK_S:
+        offset = 0.0
+        notes.append("its clock differs from that of the first video; their first images are taken as simultaneous")
+    step = 1 / max(first.frames_per_second, second.frames_per_second)
+
+    def beside(seconds: float) -> str:
+        return f"{abs(seconds):.3g} s {'after' if seconds > 0 else 'before'} the first video"
+
+    if abs(offset) > step / 2:
+        notes.append(f"by its time stamps it starts {beside(offset)}")
+    if abs(second.frames_per_second / first.frames_per_second - 1) > 0.01:
+        rates = f"{second.frames_per_second:.4g} images per second, the first video {first.frames_per_second:.4g}"
+        notes.append(f"it has {rates}; images are paired by time")
+    ends_apart = second.seconds + offset - first.seconds
+    if abs(ends_apart) > 1.5 * step and second.seconds:
+        notes.append(f"it ends {beside(ends_apart)}")
+    return offset, notes
+
+
+def pair_by_time(
+    firsts: Iterable[SourceFrame], seconds: Iterable[SourceFrame], offset: float, tolerance: float
+) -> Iterator[tuple[SourceFrame, SourceFrame | None]]:
+    """Each first image with the second image nearest in time, or None; none is used twice.
+
+    Args:
+        offset: added to the times of the second images, s.
+        tolerance: largest difference in time, s.
+    """
+    others = _in_order(seconds)
+    now, following = next(others, None), next(others, None)
+    used = -1
+    for image in firsts:
+        time = image.seconds - offset
+        while now and following and abs(following.seconds - time) <= abs(now.seconds - time):
+            now, following = following, next(others, None)
+        if now and now.index != used and abs(now.seconds - time) <= tolerance + 1e-6:
+            used = now.index
+            yield image, now
+        else:
+            yield image, None
+
+
+def _in_order(images: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
+    """Those images whose time is after that of all before."""
+    last = float("-inf")
+    for image in images:
+        if image.seconds > last:
+            last = image.seconds
+            yield image
 
 
 @dataclass(frozen=True)
 class StereoFrame:
     """The images of both cameras at one time, as stored in the source."""
 
-    index: int
-    """Position of the frame in the source, from 0."""
-    left: NDArray[np.uint8]
-    """(h, w, 3)."""
-    right: NDArray[np.uint8] | None
-    """(h, w, 3); None if the video is monocular."""
-    damaged: bool = False
-    """Bytes of one of them, or of what it was predicted from, are missing or wrong."""
+    index: int  # position of the frame in the source, from 0
+    seconds: float  # since the first image
+    left: Image  # (h, w, 3)
+    right: Image | None  # (h, w, 3); None if the video is monocular
+    damaged: bool = False  # bytes of one of them, or of what it was predicted from, are missing or wrong
 
 
 class Clip:
@@ -146,54 +273,51 @@ class Clip:
 
     def __init__(self, video: Path, cfg: PrepareConfig, calibration: Calibration | None) -> None:
         """Open the files and detect the layout; raises InputError if a file cannot be used."""
-        rate = cfg.folder_rate
-        self.source: Source = open_source(video, rate)
-        self.second: Source | None = open_source(cfg.right, rate) if cfg.right else None
-        self.swap = cfg.swap_eyes
+        self._cfg, self.swap = cfg, cfg.swap_eyes
+        self.source: Source = open_source(video, cfg.folder_rate)
+        second = open_source(cfg.right, cfg.folder_rate) if cfg.right else None
+        self._sources = [self.source, *([second] if second else [])]
         width, height = self.source.width, self.source.height
         if min(width, height) < MIN_SIDE_PX:
             got = f"{width}x{height}"
             raise input_error(video, f"images of at least {MIN_SIDE_PX}x{MIN_SIDE_PX} px", got, "Give the full size.")
         self.calibration, self._rescaled = _of_square_pixels(calibration, self.source)
+        self.layout: Layout = cfg.layout
         if cfg.layout == "auto":
             images = self.source.glimpses(cfg.start, cfg.end, GLIMPSES)
-            self.layout: Layout = find_layout(images, self.calibration, self.second is not None, str(video))
-        else:
-            self.layout = cfg.layout
-        if self.layout == "two-files" and self.second is None:
+            self.layout = find_layout(images, self.calibration, second is not None, str(video))
+        if self.layout == "two-files" and second is None:
             raise input_error("--layout two-files", "a second video", "none", "`--right VIDEO`.")
-        if self.second is not None and (self.second.width, self.second.height) != (width, height):
-            got, want = f"{self.second.width}x{self.second.height}", f"{width}x{height} px like {video}"
+        if second is not None and (second.width, second.height) != (width, height):
+            got, want = f"{second.width}x{second.height}", f"{width}x{height} px like {video}"
             raise input_error(str(cfg.right), want, got, "Pass the two videos of one recording.")
         if self.layout == "interlaced" and isinstance(self.source, Video):
             self.source.weave = True
         self.stereo = self.layout != "mono"
         self.camera_size = camera_size(width, height, self.layout)
-        self._pairing: Pairing | None = find_pairing(self.source, self.second) if self.second else None
+        self._pairing = Pairing(self.source, second) if second else None
         self._rate = self._pairing.rate if self._pairing else self.source.frames_per_second
         self.frames_per_second = cfg.frames_per_second or self._rate
-        self.unpaired = 0
-        """Images of the first video, in the last iteration, without one of the second video at their time."""
+        self._unpaired = 0  # images of the first video, in the last iteration, without one of the second at their time
         self.only: frozenset[int] | None = None
         """Positions in the source of the frames to use, of those selected; None for all."""
-        self._cfg = cfg
 
     @property
     def was_damaged(self) -> bool:
         """Whether an iteration has met damaged images."""
-        return self.source.was_damaged or (self.second is not None and self.second.was_damaged)
+        return any(source.was_damaged for source in self._sources)
 
     @property
     def notes(self) -> list[str]:
         """What is particular about the video files, one line each, after a complete iteration."""
-        notes = [note for source in (self.source, self.second) if source for note in source.notes]
+        notes = [note for source in self._sources for note in source.notes]
         if self._rescaled:
             notes.append("the calibration belongs to the stored pixels, which are not square; it is scaled with them")
         if self._pairing and self._pairing.note:
             notes.append(self._pairing.note)
-        if self.unpaired:
+        if self._unpaired:
             name = self.source.path.name
-            notes.append(f"{name}: {self.unpaired} images have none of the second camera and are left out")
+            notes.append(f"{name}: {self._unpaired} images have none of the second camera and are left out")
         return notes
 
     @property
@@ -213,32 +337,29 @@ class Clip:
         Raises:
             InputError: a file is damaged, or the two videos have no time in common.
         """
-        if self.second is None or self._pairing is None:
-            for image in selection.pick(self.source):
+        yield from selection.pick(self._all_frames())
+        if self._pairing and not selection.taken:
+            fix, want = "Pass the two videos of one recording.", f"images at the times of {self.source.path}"
+            raise input_error(self._sources[1].path, want, "none", fix)
+
+    def _all_frames(self) -> Iterator[StereoFrame]:
+        if self._pairing is None:
+            for image in self.source:
                 yield self._stereo_frame(image, *split_cameras(image.rgb_u8, self.layout))
             return
-        self.unpaired, other = 0, None
-
-        def paired() -> Iterator[SourceFrame]:
-            nonlocal other
-            for image, other in self._pairing.pairs(self.source, self.second):
-                if other is None:
-                    self.unpaired += self._cfg.start <= image.seconds < self._cfg.end
-                else:
-                    yield image
-
-        for image in selection.pick(paired()):
-            yield self._stereo_frame(image, image.rgb_u8, other.rgb_u8, damaged=other.damaged)
-        if not selection.taken:
-            hint = "Pass the two videos of one recording."
-            raise input_error(self.second.path, f"images at the times of {self.source.path}", "none", hint)
+        self._unpaired = 0
+        for image, other in self._pairing:
+            if other is None:
+                self._unpaired += self._cfg.start <= image.seconds < self._cfg.end
+            else:
+                yield self._stereo_frame(image, image.rgb_u8, other.rgb_u8, other.damaged)
 
     def _stereo_frame(
-        self, image: SourceFrame, first: NDArray[np.uint8], second: NDArray[np.uint8] | None, *, damaged: bool = False
+        self, image: SourceFrame, first: Image, second: Image | None, damaged: bool = False
     ) -> StereoFrame:
         if self.swap and second is not None:
             first, second = second, first
-        return StereoFrame(image.index, first, second, damaged or image.damaged)
+        return StereoFrame(image.index, image.seconds, first, second, damaged or image.damaged)
 
 
 def _of_square_pixels(calibration: Calibration | None, source: Source) -> tuple[Calibration | None, bool]:
@@ -254,21 +375,3 @@ def _of_square_pixels(calibration: Calibration | None, source: Source) -> tuple[
         return calibration, False
     size = calibration.size and (round(calibration.size[0] * aspect), calibration.size[1])
     return calibration.scaled(aspect, 1.0, size), True
-
-
-class EvenSample:
-    """Keeps a few frames, evenly spaced, of a stream of unknown length."""
-
-    def __init__(self, most: int) -> None:
-        """Args: most: number of frames to keep; at least half of it for a long stream."""
-        self.kept: list[StereoFrame] = []
-        self._most, self._step, self._seen = most, 1, 0
-
-    def add(self, stereo_frame: StereoFrame) -> None:
-        """Add the next frame of the stream."""
-        if self._seen % self._step == 0:
-            if len(self.kept) == self._most:
-                self.kept, self._step = self.kept[::2], 2 * self._step
-            if self._seen % self._step == 0:
-                self.kept.append(stereo_frame)
-        self._seen += 1

@@ -13,8 +13,7 @@ from ..core.checks import InputError, input_error
 from ..system.atomic import CannotWrite, complete_folder, reject_current_folder, reject_occupied, write_json, writing
 from ..system.file_lock import locked
 
-PLAN = "plan.json"
-"""Inputs and options of the folder. If they changed, the work starts from the beginning."""
+PLAN = "plan.json"  # inputs and options of the folder. If they changed, the work starts from the beginning.
 
 
 @contextmanager
@@ -68,5 +67,4 @@ def _plan_of(folder: Path) -> Any:
 
 def frames_done(folder: Path, parts: list[str]) -> int:
     """Number of complete frames of an interrupted run; the last frame may be incomplete and does not count."""
-    counts = [len(list((folder / part).glob("*.png"))) for part in parts]
-    return max(min(counts) - 1, 0)
+    return max(min(len(list((folder / part).glob("*.png"))) for part in parts) - 1, 0)

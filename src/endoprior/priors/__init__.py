@@ -1,10 +1,9 @@
-"""Image priors for sampling Gaussians: highlights (`specular`), texture (`salience`) and their product (`joint`).
+"""Image priors for sampling Gaussians: highlights (`specular`), texture, and their product (`joint`).
 
 NumPy only; every function works on one image.
 """
 
-from .joint import joint_texture_prior
-from .salience import Border, edge_magnitude, salience
+from .joint import Border, edge_magnitude, joint_texture_prior, salience
 from .specular import specular_likelihood
 
 __all__ = ["Border", "edge_magnitude", "joint_texture_prior", "salience", "specular_likelihood"]

@@ -39,6 +39,6 @@ def specular_likelihood(rgb: NDArray[np.floating], value_threshold: float | None
     return np.where(middle > np.float32(CLIP_THRESHOLD), np.float32(1), bright * pale)
 
 
-def _sigmoid(x: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sigmoid(x: NDArray[np.floating]) -> NDArray[np.floating]:
     """1 / (1 + exp(-x)), written with tanh so that no argument overflows."""
     return np.float32(0.5) * (np.float32(1) + np.tanh(np.float32(0.5) * x))

@@ -70,7 +70,6 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, kernels: Kernels, camera: Camera, opacities: Tensor, *gaussians: Tensor) -> Tensors:
-        """Project, and evaluate the colors."""
         gaussians = tuple(tensor.contiguous() for tensor in gaussians)
         outputs = kernels.project_forward(gaussians, opacities.contiguous(), camera)
         ctx.save_for_backward(*gaussians, outputs[-1])
@@ -81,7 +80,6 @@ class Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        """Chain rule through projection and colors."""
         *gaussians, radii = ctx.saved_tensors
         contiguous = tuple(v.contiguous() for v in cotangents[:-1])
         return None, None, None, *ctx.kernels.project_backward(tuple(gaussians), ctx.camera, radii, contiguous)
@@ -94,7 +92,6 @@ class Composite(torch.autograd.Function):
     def forward(
         ctx: Any, kernels: Kernels, size: tuple[int, int], radii: Tensor, background: Tensor, *gaussians: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Sort into tiles and blend."""
         gaussians = tuple(tensor.contiguous() for tensor in gaussians)
         tiles = kernels.bin_tiles(gaussians, radii, size)
         color, depth, transmittance, tile_ends = kernels.composite_forward(tiles, background.contiguous(), size)
@@ -105,7 +102,6 @@ class Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor) -> tuple[Tensor | None, ...]:
-        """Chain rule through the blending."""
         conic_ldl, color_slopes2d, opacities, *images = ctx.saved_tensors
         cotangents = tuple(v.contiguous() for v in (v_color, v_depth, v_alpha))
         lists = (ctx.tiles, ctx.tile_ends)

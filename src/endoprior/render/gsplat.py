@@ -1,30 +1,23 @@
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 """The backend that calls gsplat (Apache-2.0, an extra), float32 on one CUDA device.
 
-gsplat's separate steps are used and not its `rasterization`: color and z are composited in one pass of four channels,
-ten where colors have slopes, the gradient of z can be stopped, and `means2d` is the tensor whose gradient is kept. Once
-per call the host waits for the device, to count the tiles.
+gsplat's separate steps are used and not its `rasterization`: color and z are composited in one pass, the gradient of z
+can be stopped, and `means2d` is the tensor whose gradient is kept. Once per call the host waits for the device.
 
-Where gsplat 1.5.3 differs from `reference`, read from its sources, and what that means for "agrees within 1e-3":
+Where gsplat 1.5.3 differs from `reference`, read from its sources:
 
-- One Gaussian's alpha ends at 0.999, not at ALPHA_MAX = 0.99 (its later sources have 0.99). In the core of a Gaussian
-  of opacity above 0.99, within 0.14 standard deviations, alpha differs by up to 0.009, and a gradient passes. Capping
-  the opacity instead would be off by as much, over the whole footprint. Rendered by `numba` with 0.999, no more than 5
-  of 327,680 pixels of two trained scenes changed by more than 1e-3. Everything else agrees.
-- alpha < ALPHA_MIN is left out pixel by pixel, as here: its tiles hold the bounding box of the ellipse cut at 3.33
-  standard deviations, where alpha is below ALPHA_MIN for every opacity up to 1. The footprint is the same. `radii` is
-  computed here, as gsplat's counts Gaussians that touch no pixel center.
+- One Gaussian's alpha ends at 0.999, not at ALPHA_MAX = 0.99, and a gradient passes: alpha differs by up to 0.009 in
+  the core of a Gaussian of opacity above 0.99; of two trained scenes, at most 5 of 327,680 pixels by more than 1e-3.
 - A pixel stops where its transmittance would become <= STOP_TRANSMITTANCE, here where it would become less.
-- It computes with fast math. Where an edge, an order or a stop depends on the last bits, one Gaussian more or less
-  counts at a pixel, at an edge 1/255 of its contrast: a handful of pixels of a full image, none of most.
+- It computes with fast math: where an edge, an order or a stop depends on the last bits, one Gaussian more or less
+  counts at a pixel.
 - The determinant of a footprint is xx yy - xy^2, which cancels: a needle 300 px long is off by a few percent, and one
-  whose determinant comes out <= 0 is culled. The Jacobian, its margin and its gradient are the same.
+  whose determinant comes out <= 0 is culled.
 - It keeps z == near_plane and NaN. So the plane given is the number next to NEAR_Z, and what `reference` culls is moved
-  behind the camera before gsplat sees it, together with what might overflow there: a standard deviation above
-  LARGEST_SIGMA px, a number above LARGEST, a coefficient above LARGEST_SH.
+  behind the camera before gsplat sees it, together with what might overflow there.
+- `radii` is computed here, as gsplat's counts Gaussians that touch no pixel center.
 - Gradients are summed with atomics: images are bit-identical for equal input, gradients are not. The backward pass
   starts from 1 - alpha, of which a full pixel keeps 3 digits: up to 0.1 % there.
-- Order is by the bits of z, ties by index. Blur (no compensation), pixel centers, background, spherical harmonics and
-  the cut-off of color at 0 are the same.
 """
 
 from __future__ import annotations
@@ -39,8 +32,8 @@ from torch import Tensor
 from ..core.checks import InputError
 from ..core.shell import install_command
 from ..core.types import Camera, RenderOutput, Splats
-from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
-from .projection import FIELDS, check, check_device, color_slopes, jacobian_limits, project
+from .constants import BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
+from .projection import FIELDS, check, check_device, color_slopes, jacobian_limits, project, radii_of
 
 NEXT_STEP = f"Run `{install_command('cuda')}`; `endoprior doctor` tells what is missing."
 
@@ -73,17 +66,16 @@ class Lens(NamedTuple):
     Ks: Tensor
     """(B, 1, 3, 3) intrinsics, px."""
     center: Tensor
-    """(B, 1, 3) position in the world, mm."""
     behind: Tensor
-    """(B, 1, 3) a point behind it: what lies there is culled."""
-    z_row: Tensor
-    """(B, 1, 3) the z axis in the world, and"""
-    z_shift: Tensor
-    """(B, 1) z of the world's origin, mm: z = means . z_row + z_shift."""
+    """(B, 1, 3) position in the world, mm, and a point behind it: what lies there is culled."""
     last_pixel: Tensor
     """(B, 1, 2) center of the last pixel, px."""
     widest: Tensor
     """(B, 1) of a Gaussian, standard deviation / z at which its footprint could be LARGEST_SIGMA wide."""
+
+    def depths(self, points: Tensor) -> Tensor:
+        """(B, N) camera-space z of (B, N, 3) points, mm."""
+        return (points * self.viewmats[:, :, 2, :3]).sum(-1) + self.viewmats[:, :, 2, 3]
 
 
 def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True) -> RenderOutput:
@@ -129,20 +121,9 @@ def _render(
     together = Splats(all_means, quats, scales, opacities, coefficients, slopes)
     lens = _together([lens_of(camera, background.device) for camera in cameras])
     means = torch.where(_usable(together, lens)[..., None], all_means, lens.behind)
-    found = gsplat.fully_fused_projection(
-        means,
-        None,
-        quats,
-        scales,
-        lens.viewmats,
-        lens.Ks,
-        width,
-        height,
-        eps2d=BLUR_PX2,
-        near_plane=NEAR_PLANE,
-        far_plane=OVERFLOW,
-        opacities=opacities.detach(),
-    )
+    limits = {"eps2d": BLUR_PX2, "near_plane": NEAR_PLANE, "far_plane": OVERFLOW, "opacities": opacities.detach()}
+    seen = lens.viewmats, lens.Ks, width, height
+    found = gsplat.fully_fused_projection(means, None, quats, scales, *seen, **limits)
     boxes, centers, depths, conics = (each.squeeze(1) for each in found[:4])  # of the one camera of each time step
     kept = (boxes > 0).all(-1)  # rows of the others were never written
     # Each image gets a tensor of its own, whose gradient can be kept.
@@ -156,22 +137,16 @@ def _render(
         channels = _sloped(channels, centers, splats, cameras)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     _, pairs, pair_ids = gsplat.isect_tiles(centers, boxes, depths, TILE, tiles_x, tiles_y)
-    blended, alpha = gsplat.rasterize_to_pixels(
-        centers,
-        conics,
-        channels,
-        opacities,
-        width,
-        height,
-        TILE,
-        gsplat.isect_offset_encode(pairs, steps, tiles_x, tiles_y),
-        pair_ids,
-    )
+    offsets = gsplat.isect_offset_encode(pairs, steps, tiles_x, tiles_y)
+    painted = centers, conics, channels, opacities, width, height, TILE, offsets, pair_ids
+    blended, alpha = gsplat.rasterize_to_pixels(*painted)
     if sloped:
         blended = _at_pixels(blended)
     color, depth = blended.split([3, 1], -1)
     color = color + (1 - alpha) * background  # given to gsplat, its backward pass reads it at every Gaussian of a pixel
-    radii = _radii(centers, conics, opacities, kept, lens)
+    a, b, c = torch.where(kept[..., None], conics.detach(), 1).unbind(-1)
+    det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
+    radii = radii_of(centers, torch.stack([c, -b, a], -1) / det[..., None], opacities, kept, lens.last_pixel)
     return [RenderOutput(*image) for image in zip(color, alpha[..., 0], depth[..., 0], means2d, radii, strict=True)]
 
 
@@ -194,35 +169,22 @@ def _at_pixels(blended: Tensor) -> Tensor:
 
 def lens_of(camera: Camera, device: torch.device) -> Lens:
     """The camera's numbers on that device. Those of cameras seen before are there already: no copy, no waiting."""
-    pose = np.ascontiguousarray(camera.world_to_camera, np.float64).tobytes()
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return _lens(camera.width, camera.height, *map(float, intrinsics), pose, device)
-
-
-@lru_cache(maxsize=KEPT_CAMERAS)
-def _lens(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, pose: bytes, device: torch.device
-) -> Lens:
-    # By value: an array that is changed in place, or an address that is used again, finds no stale numbers.
-    view = np.frombuffer(pose).reshape(4, 4)
-    camera = Camera(width, height, fx, fy, cx, cy, view)
+    view, (fx, fy, cx, cy) = np.asarray(camera.world_to_camera), (camera.fx, camera.fy, camera.cx, camera.cy)
     slope_x, slope_y = (max(-low, high) for low, high in np.array(jacobian_limits(camera)).reshape(2, 2))
     steepest = max(fx * np.hypot(1, slope_x), fy * np.hypot(1, slope_y))
     away = 1 + 1e-3 * np.linalg.norm(camera.center)  # mm; more than float32 rounds off
-    parts = {
-        "viewmats": view.reshape(1, 1, 4, 4),
-        "Ks": np.array([[[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]]]),
-        "center": camera.center[None, None],
-        "behind": (camera.center - away * view[2, :3])[None, None],
-        "z_row": view[None, 2:3, :3],
-        "z_shift": view[2:3, 3:],
-        "last_pixel": np.array([[[width - 0.5, height - 0.5]]]),
-        "widest": np.array([[LARGEST_SIGMA / steepest]]),
-    }
-    packed = torch.from_numpy(np.concatenate([part.ravel() for part in parts.values()]).astype(np.float32)).to(device)
-    pieces = packed.split([part.size for part in parts.values()])
-    tensors = {name: piece.view(part.shape) for (name, part), piece in zip(parts.items(), pieces, strict=True)}
-    return Lens(**tensors)
+    intrinsics = (fx, 0, cx, 0, fy, cy, 0, 0, 1)
+    ends = (camera.width - 0.5, camera.height - 0.5, LARGEST_SIGMA / steepest)
+    numbers = np.concatenate([view.ravel(), intrinsics, camera.center, camera.center - away * view[2, :3], ends])
+    return _on_device(numbers.astype(np.float32).tobytes(), device)
+
+
+@lru_cache(maxsize=KEPT_CAMERAS)
+def _on_device(numbers: bytes, device: torch.device) -> Lens:
+    # By value: an array that is changed in place, or an address that is used again, finds no stale numbers.
+    parts = torch.from_numpy(np.frombuffer(numbers, np.float32).copy()).to(device).split([16, 9, 3, 3, 2, 1])
+    shapes = (1, 1, 4, 4), (1, 1, 3, 3), (1, 1, 3), (1, 1, 3), (1, 1, 2), (1, 1)
+    return Lens(*(part.view(shape) for part, shape in zip(parts, shapes, strict=True)))
 
 
 def _together(lenses: list[Lens]) -> Lens:
@@ -256,25 +218,11 @@ def _nothing(splats: Splats, camera: Camera, background: Tensor) -> RenderOutput
 def _usable(splats: Splats, lens: Lens) -> Tensor:
     """(B, N) False where a number is not finite or could become so; written with `<`, which is False for NaN."""
     numbers = torch.cat([splats.means, splats.quats, splats.scales, splats.opacities[..., None]], -1)
-    z = (splats.means * lens.z_row).sum(-1) + lens.z_shift
+    slopes = color_slopes(splats)
     return (
         (numbers.abs() < LARGEST).all(-1)
         & (splats.sh.abs() < LARGEST_SH).flatten(2).all(-1)
-        & (splats.color_slopes.abs() < LARGEST_SH).flatten(2).all(-1)
+        & (slopes.abs() < LARGEST_SH).flatten(2).all(-1)
         & (splats.quats.norm(dim=-1) >= MIN_QUAT)
-        & (splats.scales.amax(-1) < lens.widest * z)
+        & (splats.scales.amax(-1) < lens.widest * lens.depths(splats.means))
     )
-
-
-@torch.no_grad()
-def _radii(means2d: Tensor, conics: Tensor, opacities: Tensor, kept: Tensor, lens: Lens) -> Tensor:
-    """(B, N) int32 as in `projection`: ceil(3 sigma_max), and 0 unless the footprint's box holds a pixel center."""
-    a, b, c = torch.where(kept[..., None], conics, 1).unbind(-1)
-    det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
-    xx, yy = c / det, a / det
-    long_axis = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), b / det)
-    reach = (2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))).sqrt()
-    box = reach[..., None] * torch.stack([xx, yy], -1).sqrt()
-    touches = ((means2d + box >= 0.5) & (means2d - box <= lens.last_pixel)).all(-1)
-    radii = (3 * long_axis.sqrt()).ceil().clamp(max=2**30).to(torch.int32)
-    return torch.where(kept & touches & (opacities >= ALPHA_MIN), radii, 0)

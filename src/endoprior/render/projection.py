@@ -7,7 +7,7 @@ limited to a little outside the image (`JACOBIAN_MARGIN`) because the linearizat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -41,11 +41,7 @@ class Projected:
 
 
 def check(splats: Splats, background: Tensor) -> int:
-    """Check what every backend requires of its input, and return the SH degree.
-
-    Raises:
-        ValueError: shapes disagree, types differ, or K is not 1, 4, 9 or 16.
-    """
+    """Raise ValueError where shapes disagree, types differ, or K is not 1, 4, 9 or 16; return the SH degree."""
     sizes = check_shape(
         "means:N,3 quats:N,4 scales:N,3 opacities:N sh:N,K,3", **{n: getattr(splats, n) for n in FIELDS}
     )
@@ -58,11 +54,7 @@ def check(splats: Splats, background: Tensor) -> int:
 
 
 def check_device(splats: Splats, background: Tensor, device_type: str) -> None:
-    """Check what a backend of one type of device requires besides `check`.
-
-    Raises:
-        ValueError: something is not float32, or not on one device of that type.
-    """
+    """Raise ValueError where something is not float32, or not on one device of that type."""
     devices = {tensor.device for tensor in splats.tensors.values()} | {background.device}
     if splats.means.dtype != torch.float32 or len(devices) > 1 or splats.means.device.type != device_type:
         found = sorted(map(str, devices))
@@ -100,22 +92,24 @@ def project(splats: Splats, camera: Camera) -> Projected:
     Culled are: center at or behind `NEAR_Z`; any number not finite, or a result that overflows; a quaternion shorter
     than `MIN_QUAT`; a footprint (where alpha >= `ALPHA_MIN`) that misses every pixel center's bounding box.
     """
+    splats = replace(splats, color_slopes=color_slopes(splats))
     with torch.no_grad():  # decide first; a `where` after the fact would let NaN into the gradients
         usable = _usable(splats, camera)
-    placeholder = _placeholder(splats, camera)
-    safe = {}
-    for name in (*FIELDS, "color_slopes"):
-        values = getattr(splats, name) if name in FIELDS else color_slopes(splats)
-        keep = usable.reshape(-1, *(1,) * (values.dim() - 1))
-        safe[name] = torch.where(keep, values, placeholder[name])
-    means2d, cov2d, det, z, colors, slopes2d = _project(Splats(**safe), camera)
-    radii = _radii(means2d, cov2d, safe["opacities"], usable, camera)
+    stand_in = _placeholder(splats, camera)
+    safe = Splats(
+        **{
+            name: torch.where(usable.reshape(-1, *(1,) * (values.dim() - 1)), values, stand_in[name])
+            for name, values in splats.tensors.items()
+        }
+    )
+    means2d, cov2d, det, z, colors, slopes2d = _project(safe, camera)
+    last_pixel = means2d.new_tensor([camera.width, camera.height]) - 0.5
+    radii = radii_of(means2d, cov2d, safe.opacities, usable, last_pixel)
     return Projected(means2d, cov2d, z, colors, slopes2d, radii, det)
 
 
 def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Means, covariances and their determinants, z, colors and their slopes of Gaussians trusted to be in front of the
-    camera."""
+    """Centers, covariances and their determinants, z, colors and their slopes of Gaussians in front of the camera."""
     view = torch.as_tensor(camera.world_to_camera, dtype=splats.means.dtype, device=splats.means.device)
     x, y, z = (splats.means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
     left, right, top, bottom = jacobian_limits(camera)
@@ -182,13 +176,17 @@ def _placeholder(splats: Splats, camera: Camera) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def _radii(means2d: Tensor, cov2d: Tensor, opacities: Tensor, usable: Tensor, camera: Camera) -> Tensor:
-    """ceil(3 sigma_max), and 0 unless the box around {alpha >= ALPHA_MIN} holds a pixel center's coordinates."""
+def radii_of(means2d: Tensor, cov2d: Tensor, opacities: Tensor, usable: Tensor, last_pixel: Tensor) -> Tensor:
+    """(..., N) int32 ceil(3 sigma_max), and 0 unless the box around {alpha >= ALPHA_MIN} holds a pixel center.
+
+    Args:
+        means2d, cov2d, opacities, usable: (..., N, 2), (..., N, 3), (..., N), (..., N).
+        last_pixel: center of the last pixel (x, y), px.
+    """
     xx, xy, yy = cov2d.unbind(-1)
     long_axis = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
     reach = (2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))).sqrt()  # in standard deviations
-    box = reach[:, None] * torch.stack([xx, yy], -1).sqrt()
-    size = means2d.new_tensor([camera.width, camera.height])
-    touches = ((means2d + box >= 0.5) & (means2d - box <= size - 0.5)).all(-1)
+    box = reach[..., None] * torch.stack([xx, yy], -1).sqrt()
+    touches = ((means2d + box >= 0.5) & (means2d - box <= last_pixel)).all(-1)
     radii = (3 * long_axis.sqrt()).ceil().clamp(max=2**30).to(torch.int32)
     return torch.where(usable & touches & (opacities >= ALPHA_MIN), radii, 0)

@@ -15,12 +15,10 @@ from .projection import check, project
 
 
 def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True) -> RenderOutput:
-    """Render the Gaussians near to far (Kerbl et al. 2023, Eq. 3); ties in z keep their order.
-
-    See `render.Rasterizer`.
-    """
+    """Render the Gaussians near to far (Kerbl et al. 2023, Eq. 3); ties keep their order. See `render.Rasterizer`."""
     check(splats, background)
     seen = project(splats, camera)
+    assert seen.det is not None
     order = seen.z.argsort(stable=True)
     order = order[seen.radii[order] > 0]
     alpha = _alpha(seen.means2d[order], seen.cov2d[order], seen.det[order], splats.opacities[order], camera)

@@ -23,11 +23,7 @@ C3_ZZZ, C3_ZXX = sqrt(7 / (16 * pi)), sqrt(105 / (16 * pi))
 
 
 def degree_of(num_coefficients: int) -> int:
-    """Degree whose expansion has that many coefficients.
-
-    Raises:
-        ValueError: it is not 1, 4, 9 or 16.
-    """
+    """Degree whose expansion has that many coefficients; ValueError if they are not 1, 4, 9 or 16."""
     degree = isqrt(num_coefficients) - 1
     if (degree + 1) ** 2 != num_coefficients or not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"sh must have 1, 4, 9 or 16 coefficients per channel; got {num_coefficients}")
@@ -40,8 +36,8 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     values = [torch.full_like(x, C0)]
     if degree >= 1:
         values += [-C1 * y, C1 * z, -C1 * x]
+    xx, yy, zz = x * x, y * y, z * z
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
         values += [C2_XY * x * y, -C2_XY * y * z, C2_ZZ * (2 * zz - xx - yy), -C2_XY * x * z, C2_XX * (xx - yy)]
     if degree >= 3:
         values += [
@@ -57,12 +53,6 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh: Tensor, directions: Tensor) -> Tensor:
-    """(N, 3) color >= 0 seen along (N, 3) unit directions: the expansion + 0.5, cut off at 0 (no gradient there).
-
-    Args:
-        sh: (N, K, 3) coefficients.
-    Raises:
-        ValueError: K is not 1, 4, 9 or 16.
-    """
+    """(N, 3) color >= 0 of (N, K, 3) `sh` along (N, 3) unit directions: the expansion + 0.5, cut off at 0."""
     values = basis(directions, degree_of(sh.shape[1]))
     return ((values[:, :, None] * sh).sum(1) + 0.5).clamp(min=0)

@@ -11,12 +11,14 @@ import os
 import sys
 from importlib.metadata import version
 from importlib.util import find_spec
+from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..core.checks import InputError
+from ..core.config import Backend
 from ..core.types import Camera, Splats
 from . import ON_GPU, load
 
@@ -42,7 +44,7 @@ def small_scene() -> tuple[Splats, Camera]:
     return Splats(*(torch.tensor(value, dtype=torch.float32) for value in values)), camera
 
 
-def rendered(backend: str, device: str) -> dict[str, Tensor]:
+def rendered(backend: Backend, device: str) -> dict[str, Tensor]:
     """Color, alpha, depth and the gradients of the small scene, on the CPU, float64."""
     scene, camera = small_scene()
     dtype = torch.float64 if backend == "reference" else torch.float32
@@ -50,11 +52,11 @@ def rendered(backend: str, device: str) -> dict[str, Tensor]:
     out = load(backend)(Splats(**leaves), camera, background=torch.full((3,), 0.2, device=device, dtype=dtype))
     (out.color.square().sum() + out.alpha.sum() + 0.01 * out.depth.sum()).backward()
     found = {"color": out.color, "alpha": out.alpha, "depth": out.depth}
-    found |= {f"gradient of {name}": value.grad for name, value in leaves.items()}
+    found |= {f"gradient of {name}": value.grad for name, value in leaves.items() if value.grad is not None}
     return {name: value.detach().cpu().double() for name, value in found.items()}
 
 
-def compare(backend: str, device: str) -> str:
+def compare(backend: Backend, device: str) -> str:
     """The differences from `reference`, in words.
 
     Raises:
@@ -63,7 +65,7 @@ def compare(backend: str, device: str) -> str:
     want, got = rendered("reference", "cpu"), rendered(backend, device)
     image = max(float((got[name] - want[name]).abs().max()) for name in ("color", "alpha"))
     others = {name: float((got[name] - value).norm() / value.norm()) for name, value in want.items()}
-    worst = max(others, key=others.get)
+    worst = max(others, key=lambda name: others[name])
     words = f"differs from `reference` by {image:.0e} in an image and {others[worst]:.0e} in the {worst}"
     if not (image <= IMAGE_TOLERANCE and others[worst] <= GRADIENT_TOLERANCE):  # also NaN
         raise ArithmeticError(words)
@@ -81,7 +83,7 @@ def gsplat_is_compiled() -> bool:
     return any(name.endswith((".so", ".pyd")) for pattern in files for name in glob.glob(pattern))
 
 
-def attempt(backend: str, *, compiles: bool) -> str:
+def attempt(backend: Backend, *, compiles: bool) -> str:
     """What works, in one line; raises whatever the backend does.
 
     Args:
@@ -103,7 +105,7 @@ def attempt(backend: str, *, compiles: bool) -> str:
     return f"{torch.cuda.get_device_name()}, torch {torch.__version__}, {backend} {version(backend)}; {words}"
 
 
-def main(backend: str, *options: str) -> int:
+def main(backend: Backend, *options: str) -> int:
     """Print the answer as the last line."""
     try:
         print(f"\n{' '.join(attempt(backend, compiles='compile' in options).split())}")
@@ -116,4 +118,5 @@ def main(backend: str, *options: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    backend, *options = sys.argv[1:]
+    sys.exit(main(cast(Backend, backend), *options))

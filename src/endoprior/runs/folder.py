@@ -1,16 +1,19 @@
-"""The run folder: who may write to it, and `config.json`, which says what run it holds: config, versions, data."""
+"""The run folder: who may write to it, `config.json`, which says what run it holds, and the checkpoint to resume it."""
 
 from __future__ import annotations
 
 import shutil
+import signal
 import sys
-from collections.abc import Callable, Iterator
+import time as clock
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import yaml
+from torch import Tensor
 
 from ..core.checks import InputError, input_error
 from ..core.config import Config
@@ -19,26 +22,27 @@ from ..core.shell import command
 from ..data import FrameSequence
 from ..data.files import read_json
 from ..data.reading import kind_of, load_yaml, read_text
+from ..model.hexplane import TOUCHED
 from ..model.method import config_from
 from ..render import ON_GPU
-from ..system.atomic import is_leftover, reject_occupied
+from ..system.arrays_file import ArraySpec, load_arrays, rejecting, save_arrays
+from ..system.atomic import is_leftover, reject_occupied, remove_leftovers, write_json
 from ..system.devices import name_of
 from ..system.file_lock import locked
 from ..system.installation import source_commit
-from ..training.trainer import device_for
+from ..system.signals import handled_by
+from ..training.trainer import Observer, Stage, StepReport, Trainer, device_for, stage_length
 
-LOCK = ".lock"
-"""File that a process holds while it trains in a folder."""
+LOCK = ".lock"  # file that a process holds while it trains in a folder
 CONFIG, LOG, CHECKPOINT, SCENE = "config.json", "log.jsonl", "checkpoint.safetensors", "scene.safetensors"
-"""Names of its files."""
+CHECKPOINT_SECONDS = 60.0
+"""Longest time of work that a crash can cost, besides the iteration in progress, unless told otherwise."""
+CHECKPOINT_SHARE = 0.05  # share of the time that writing checkpoints may take: large states are written less often
+FORMAT = "endoprior-checkpoint-1"
 
 
 def reject_unusable_folder(out: Path, *, resume: bool) -> None:
-    """Reject a folder that cannot take a run; nothing is created yet.
-
-    Raises:
-        InputError: it is a file, or it holds something and `resume` is False, or its name is not usable.
-    """
+    """Raise InputError where `out` is a file, or holds something without `resume`; nothing is created yet."""
     exists = kind_of(out) == "a folder"
     if not (resume and exists):
         is_run = exists and (out / CONFIG).is_file()
@@ -47,11 +51,7 @@ def reject_unusable_folder(out: Path, *, resume: bool) -> None:
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> None:
-    """Make sure that `out` exists and can take a run.
-
-    Raises:
-        InputError: as `reject_unusable_folder`, or it cannot be made.
-    """
+    """Make sure that `out` exists and can take a run; raise InputError if it cannot."""
     reject_unusable_folder(out, resume=resume)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -81,28 +81,39 @@ def held_folder(out: Path, *, resume: bool, begin: Callable[[], None]) -> Iterat
         raise
 
 
-def accept_resumed(out: Path, cfg: Config, fingerprint: str, data: Path) -> None:
-    """Raise InputError unless `config.json` says that the folder holds a run with this config on these data."""
-    about = out / CONFIG
-    stored = read_json(about)
-    facts = stored.get("data")
-    known = facts.get("fingerprint") if isinstance(facts, dict) else None
-    reject_other_run(about, stored.get("config"), known, cfg, fingerprint, data)
+def record_run(
+    out: Path, sequence: FrameSequence, cfg: Config, fingerprint: str, *, resume: bool, **facts: Any
+) -> None:
+    """Write `config.json`: all that is needed to repeat the run, and `facts`.
+
+    Raises:
+        InputError: the run to `resume` has another config or other data; or the data changed while they were read.
+    """
+    about, backend = out / CONFIG, cfg.render.backend
+    sequence.demand_unchanged()  # what was read before is of the same state
+    if resume:
+        stored = read_json(about, "start without --resume.", "a run to resume")
+        known = _data_facts(stored).get("fingerprint")
+        reject_other_run(about, stored.get("config"), known, cfg, fingerprint, sequence.path)
+    remove_leftovers(out)  # not before the run was accepted and has the lock
+    names = ["endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless"]
+    names += [backend] if backend in ON_GPU else []
+    about_run = {
+        "config": to_dict(cfg),
+        "seed": cfg.seed,
+        "backend": backend,
+        "device": name_of(device_for(backend)),
+        "commit": source_commit(),
+        "versions": {name: version(name) for name in names} | {"python": sys.version.split()[0]},
+        "data": {"path": str(sequence.path.resolve()), "fingerprint": fingerprint, "frames": len(sequence)},
+    }
+    write_json(about, about_run | facts)
 
 
 def reject_other_run(
     file: Path, stored_config: Any, stored_fingerprint: Any, cfg: Config, fingerprint: str, data: Path
 ) -> None:
-    """Reject resuming with another config or on other data.
-
-    Args:
-        file: where the stored ones come from; named in the message.
-        stored_config, stored_fingerprint: as read from it.
-        cfg, fingerprint: the current ones.
-        data: folder of the sequence, for the message.
-    Raises:
-        InputError: the config differs, with the names of all fields that do, or the data do.
-    """
+    """Raise InputError where the stored config, naming all fields, or the stored data differ from the current ones."""
     if changed := ", ".join(_differences(to_dict(config_of(stored_config, file)), to_dict(cfg))):
         fix = f"`{command('train', '--resume', file.parent)}` takes the options of the folder"
         raise InputError(f"{file}: config differs at {changed}. Fix: {fix}; a new run needs a new folder.")
@@ -119,45 +130,22 @@ def _differences(old: dict[str, Any], new: dict[str, Any], where: str = "") -> I
             yield f"{where}{name} ({old[name]!s:.80} in the folder, {value!s:.80} now)"
 
 
-def run_facts(sequence: FrameSequence, cfg: Config, fingerprint: str) -> dict[str, Any]:
-    """Contents of `config.json`, to repeat the run: every config field, versions, commit, backend, device, data."""
-    backend = cfg.render.backend
-    names = ["endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless"]
-    names += [backend] if backend in ON_GPU else []
-    return {
-        "config": to_dict(cfg),
-        "seed": cfg.seed,
-        "backend": backend,
-        "device": name_of(device_for(backend)),
-        "commit": source_commit(),
-        "versions": {name: version(name) for name in names} | {"python": sys.version.split()[0]},
-        "data": {"path": str(sequence.path.resolve()), "fingerprint": fingerprint, "frames": len(sequence)},
-    }
+def _data_facts(stored: dict[str, Any]) -> dict[str, Any]:
+    facts = stored.get("data")
+    return facts if isinstance(facts, dict) else {}
 
 
 def config_of_run(run: Path) -> Config:
-    """The config that a run was started with, from its `config.json`.
-
-    Raises:
-        InputError: the file is missing or cannot be used.
-    """
+    """The config that a run was started with, from its `config.json`."""
     file = run / CONFIG
     return config_of(read_json(file, "pass the folder of a run that was interrupted.").get("config"), file)
 
 
 def sequence_of_run(run: Path, hint: str = "pass --data FOLDER.") -> Path:
-    """The sequence folder a run was trained on, from its `config.json`.
-
-    Args:
-        hint: the fix of the error message.
-    Raises:
-        InputError: `config.json` is missing or does not name the folder, or the folder does not exist.
-    """
-    file = run / CONFIG
-    facts = read_json(file, hint).get("data")
-    path = facts.get("path") if isinstance(facts, dict) else None
+    """The sequence folder that a run was trained on, from its `config.json`; `hint` is the fix of the error message."""
+    path = _data_facts(read_json(run / CONFIG, hint)).get("path")
     if not isinstance(path, str) or not path:
-        raise input_error(file, "the path of the sequence", repr(path), hint)
+        raise input_error(run / CONFIG, "the path of the sequence", repr(path), hint)
     data = Path(path)
     if kind_of(data) != "a folder":
         raise input_error(data, "the sequence this run was trained on", "no such folder", hint)
@@ -165,11 +153,7 @@ def sequence_of_run(run: Path, hint: str = "pass --data FOLDER.") -> Path:
 
 
 def read_config(file: Path, base: Config) -> Config:
-    """The config in a file: `config.json` of a run, or YAML or JSON with some fields; `base` gives the others.
-
-    Raises:
-        InputError: the file cannot be read, has an unknown field, or a value of the wrong kind or range.
-    """
+    """The config in a file: `config.json` of a run, or YAML or JSON with some fields; `base` gives the others."""
     fix = "pass config.json of a run, or a YAML file with fields of the config."
     if file.suffix.lower() == ".json":
         values = read_json(file, fix)
@@ -197,3 +181,100 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """`base` with the entries of `changes`; dicts in both are merged."""
     both = {key for key in changes if isinstance(base.get(key), dict) and isinstance(changes[key], dict)}
     return base | {key: _merged(base[key], value) if key in both else value for key, value in changes.items()}
+
+
+def checkpoint_writer(path: Path, fingerprint: str, seconds: float, interrupted: Callable[[], bool]) -> Observer:
+    """Writes a checkpoint every `seconds`, and when `interrupted` says so; it then raises KeyboardInterrupt."""
+    due_at = clock.monotonic() + seconds
+
+    def observer(_report: StepReport, trainer: Trainer) -> None:
+        nonlocal due_at
+        stop, began = interrupted(), clock.monotonic()
+        if stop or began >= due_at:
+            trainer.synchronize()
+            save_checkpoint(trainer, path, fingerprint)
+            now = clock.monotonic()
+            due_at = now + max(seconds, (now - began) / CHECKPOINT_SHARE)
+        if stop:
+            raise KeyboardInterrupt
+
+    return observer
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Hold back Ctrl-C and the signals of schedulers and closing terminals until an iteration is complete.
+
+    Yields a function that says whether to stop. A second Ctrl-C stops at once.
+    """
+    pressed = False
+
+    def note(signum: int, _frame: Any) -> None:
+        nonlocal pressed
+        if pressed and signum == signal.SIGINT:
+            raise KeyboardInterrupt
+        pressed = True
+
+    with handled_by(note):
+        yield lambda: pressed
+
+
+def save_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
+    """Write everything that the next iteration depends on, and the fingerprint of the sequence.
+
+    Raises:
+        InputError: the data changed meanwhile; the checkpoint before is kept, which no changed frame went into.
+    """
+    trainer.sequence.demand_unchanged(fingerprint)
+    state = trainer.state
+    about = {"stage": int(state.stage), "iteration": state.iteration, "config": to_dict(trainer.cfg)}
+    save_arrays(path, state.arrays(), about | {"fingerprint": fingerprint}, FORMAT)
+
+
+def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
+    """Restore the saved state in `trainer`.
+
+    Raises:
+        InputError: the file is missing or damaged, or belongs to another config or other data.
+    """
+    cfg, sequence, next_step = trainer.cfg, trainer.sequence, "Train again without --resume."
+
+    def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
+        reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, sequence.path)
+        return trainer.schema()
+
+    arrays, about = load_arrays(path, {FORMAT: schema}, next_step)
+    with rejecting(path, "a training state", next_step):
+        stage, iteration = Stage(about["stage"]), about["iteration"]
+        length = stage_length(cfg, stage)
+        if type(iteration) is not int or not 0 <= iteration <= length:
+            raise InputError(
+                f"expected 0 to {length} as iteration of the {stage.name.lower()} stage; got {iteration!r:.80}."
+            )
+        before = stage_length(cfg, Stage.COARSE) if stage is Stage.FINE else 0  # a method may keep its optimizer
+        check_state(arrays, before + iteration)
+        num_frames = len(sequence.indices("train"))
+        for name, spec in trainer.schema().items():
+            if "F" in spec.shape and (got := arrays[name].shape[spec.shape.index("F")]) != num_frames:
+                raise InputError(f"expected {num_frames} training frames in {name}; got {got}.")
+    trainer.restore(stage, iteration, arrays)
+
+
+def check_state(arrays: Mapping[str, Tensor], iterations: int) -> None:
+    """Raise InputError for an array, finite and of the right shape, that no training of so many iterations produces."""
+    for name, value in arrays.items():
+        low, high, expected = 0.0, float("inf"), "no negative number"
+        if name.endswith(".steps"):
+            high, expected = iterations, f"0 to {iterations} steps"
+        elif name == "left_out":
+            high, expected = 1, "shares"
+        elif name == "tracks.rows":
+            high = len(arrays["tracks.coefficients"]) - 1
+            expected = f"rows up to {high}"
+        elif name.endswith(".marks"):
+            touched = len(arrays["optimizer.plane_adam.exp_avg"])
+            high, expected = TOUCHED if int(value.count_nonzero()) == touched else -1.0, f"{touched} touched cells"
+        elif not name.startswith("stats.") and not name.endswith((".second", ".exp_avg_sq")):
+            low = -high
+        if not bool(((value >= low) & (value <= high)).all()):
+            raise InputError(f"expected {expected} in {name}; got something else.")

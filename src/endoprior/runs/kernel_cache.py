@@ -33,25 +33,24 @@ from ..system.surroundings import python_command
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0
 """Longest time to wait, s; then, or when the process fails, kernels are compiled when they are first used."""
-WIDTH, HEIGHT, FRAMES = 64, 48, 10
-"""Size of what is trained to compile, px, and its number of frames."""
+WIDTH, HEIGHT, FRAMES = 64, 48, 10  # size of what is trained to compile, px, and its number of frames
 _filled: set[str] = set()
 
 
-def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
+def fill(cfg: Config, say: Callable[[str], None] = lambda _: None) -> None:
     """Make sure that the kernels which training and scoring with `cfg` need are in Numba's cache.
 
-    Args:
-        say: takes one line if kernels must be compiled, which takes about a minute.
+    `say` takes one line if they must be compiled.
     """
     if cfg.render.backend in ON_GPU or not method_of(cfg).has_gaussians:  # which need no Numba kernels
         return
-    key = _key(cfg)
-    if key in _filled:
+    if (key := _key(cfg)) in _filled:
         return
     _filled.add(key)
     with suppress(OSError, subprocess.SubprocessError):  # a read-only folder: Numba caches nothing either
-        marker = _cache_folder() / f"endoprior_{key}.ready"
+        beside = PACKAGE / "__pycache__" if os.access(PACKAGE, os.W_OK) else Path.home() / ".cache" / "endoprior"
+        folder = Path(os.environ.get("NUMBA_CACHE_DIR") or beside)  # where Numba keeps the kernels of this package
+        marker = folder / f"endoprior_{key}.ready"
         if marker.exists():
             return
         marker.parent.mkdir(parents=True, exist_ok=True)
@@ -80,13 +79,6 @@ def _key(cfg: Config) -> str:
     parts = (cfg.method, cfg.deformation, cfg.render, cfg.schedule.sh_degree, cfg.init.motion, *temporal)
     digest.update(json.dumps([to_dict(part) for part in parts]).encode())
     return digest.hexdigest()[:16]
-
-
-def _cache_folder() -> Path:
-    """Where Numba keeps the kernels of this package: `NUMBA_CACHE_DIR`, or beside the source."""
-    if given := os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(given)
-    return PACKAGE / "__pycache__" if os.access(PACKAGE, os.W_OK) else Path.home() / ".cache" / "endoprior"
 
 
 def tiny_sequence() -> FrameSequence:

@@ -14,12 +14,10 @@ from ..data.found_tools import read_rows
 from ..data.reading import read_bytes
 from ..model.windowed_scene import window_file
 from ..system.atomic import write_text
-from ..training.stage import Stage, StepReport
-from ..training.trainer import Observer, Trainer
+from ..training.trainer import Observer, Stage, StepReport, Trainer
 from .folder import CONFIG, LOG, SCENE
 
-LOG_EVERY = 10
-"""Iterations between two lines."""
+LOG_EVERY = 10  # iterations between two lines
 MISSED = "missed_tool_frames"
 """Frames whose masks likely miss a tool: in the last line, in the protocol of `metrics.json` and in `StepReport`."""
 MARGIN = "tool_margin_px"
@@ -29,15 +27,14 @@ MARGIN = "tool_margin_px"
 def log_writer(lines: TextIO) -> Observer:
     """Writes a line of JSON every `LOG_EVERY` iterations, after events of density control, and at the end."""
 
-    def observer(report: StepReport, trainer: Trainer) -> None:
-        if report.iteration % LOG_EVERY and not report.event and report.missed_tool_frames is None:
+    def observer(report: StepReport, _trainer: Trainer) -> None:
+        missed = report.missed_tool_frames
+        if report.iteration % LOG_EVERY and not report.event and missed is None:
             return
         line: dict[str, Any] = {"stage": report.stage.name.lower(), "iteration": report.iteration}
-        line["num_gaussians"] = report.num_gaussians
-        if report.event:
-            line["event"] = report.event
-        if report.missed_tool_frames is not None:
-            line[MISSED] = report.missed_tool_frames
+        line |= {"num_gaussians": report.num_gaussians}
+        line |= {"event": report.event} if report.event else {}
+        line |= {MISSED: missed} if missed is not None else {}
         line |= {"terms": report.terms, "seconds": round(report.seconds, 4)}
         lines.write(json.dumps(line) + "\n")
 
@@ -46,18 +43,15 @@ def log_writer(lines: TextIO) -> Observer:
 
 def cut_log(log: Path, stage: Stage, iteration: int) -> None:
     """Drop the lines of iterations after a checkpoint: they will be written again."""
-    if not log.exists():
-        return
-    lines = read_log(log, "stage", "iteration")
-    kept = [line for line in lines if (Stage[line["stage"].upper()], line["iteration"]) <= (stage, iteration)]
-    write_text(log, "".join(json.dumps(line) + "\n" for line in kept))
+    if log.exists():
+        lines = read_log(log, "stage", "iteration")
+        kept = [line for line in lines if (Stage[line["stage"].upper()], line["iteration"]) <= (stage, iteration)]
+        write_text(log, "".join(json.dumps(line) + "\n" for line in kept))
 
 
 def read_log(log: Path, *names: str) -> list[dict[str, Any]]:
-    """The lines of `log.jsonl`, without a last one that a crash cut short.
+    """The lines of `log.jsonl`, without a last one that a crash cut short; each must have the `names`.
 
-    Args:
-        names: what each line must have.
     Raises:
         InputError: it cannot be read, or another line is broken.
     """
@@ -79,11 +73,9 @@ def read_log(log: Path, *names: str) -> list[dict[str, Any]]:
 class Growth:
     """Counts of Gaussians, of all windows together."""
 
-    first: int
-    """In the first line of the log: before any event, unless one comes within the first iterations."""
+    first: int  # in the first line of the log: before any event, unless one comes within the first iterations
     last: int
-    num_events: int
-    """Events of density control."""
+    num_events: int  # events of density control
     changes: Counter[str]
     """How many Gaussians were `cloned`, `split` or removed by a rule (`removed_RULE`); 0 for what never happened."""
 
@@ -95,27 +87,25 @@ class Growth:
 
 def growth_of(run: Path) -> Growth | None:
     """The growth in a run folder; None without a log, or where nothing grows, as in a radiance field."""
-    log = run / LOG
-    if not log.is_file():
+    if not (run / LOG).is_file():
         return None
-    lines = read_log(log, "num_gaussians")
-    last = {line.get("window", 0): line["num_gaussians"] for line in lines}
-    first = {line.get("window", 0): line["num_gaussians"] for line in reversed(lines)}
+    lines = read_log(run / LOG, "num_gaussians")
+    first, last = (
+        sum({line.get("window", 0): line["num_gaussians"] for line in ordered}.values())
+        for ordered in (reversed(lines), lines)
+    )
     events, changes = [line["event"] for line in lines if "event" in line], Counter[str]()
     for event in events:
         changes.update(event)
-    total = sum(first.values())
-    return Growth(total, sum(last.values()), len(events), changes) if total else None
+    return Growth(first, last, len(events), changes) if first else None
 
 
 def mask_facts(run: Path) -> dict[str, Any]:
     """For the protocol of `metrics.json`: what the training in a run folder found out about tool masks."""
     about = _config(run)
-    margins = [about.get(MARGIN)]
-    if windows := _windows(about):
-        folders = [window_file(run / SCENE, k).parent for k in range(len(windows))]
-        margins = [_config(folder).get(MARGIN) for folder in folders]
-    facts: dict[str, Any] = {}
+    windows, facts = _windows(about), dict[str, Any]()
+    folders = [window_file(run / SCENE, k).parent for k in range(len(windows))]
+    margins = [_config(folder).get(MARGIN) for folder in folders] or [about.get(MARGIN)]
     if all(isinstance(margin, int) for margin in margins):
         facts[MARGIN] = margins if windows else margins[0]
     if (missed := missed_tools_of(run)) is not None:
@@ -125,11 +115,10 @@ def mask_facts(run: Path) -> dict[str, Any]:
 
 def missed_tools_of(run: Path) -> list[int] | None:
     """Frames of the sequence, ascending, in a run folder; None where training trusted the masks, or has no log."""
-    log = run / LOG
-    if not log.is_file():
+    if not (run / LOG).is_file():
         return None
     windows, found = _windows(_config(run)), None
-    for line in read_log(log):
+    for line in read_log(run / LOG):
         try:
             frames, first = line[MISSED], int(windows[line["window"]][0]) if "window" in line else 0
             found = (found or set()) | {first + int(frame) for frame in frames}

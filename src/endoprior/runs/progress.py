@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING
 from ..system.console import say
 
 if TYPE_CHECKING:
-    from ..training.stage import StepReport
-    from ..training.trainer import Observer, Trainer
+    from ..training.trainer import Observer, StepReport, Trainer
 
-PLAIN_EVERY_SECONDS = 10.0
-"""Time between two lines in a log file."""
+PLAIN_EVERY_SECONDS = 10.0  # time between two lines in a log file
 NOTEBOOK_EVERY_SECONDS = 0.5
 
 
@@ -31,10 +29,10 @@ def training_progress() -> Iterator[Observer]:
         with _bar() as observer:
             yield observer
     elif _in_notebook():
-        yield _Lines(NOTEBOOK_EVERY_SECONDS, _say_in_place)
+        yield _lines(NOTEBOOK_EVERY_SECONDS, _say_in_place)
         print(file=sys.stderr)
     else:
-        yield _Lines(PLAIN_EVERY_SECONDS, say)
+        yield _lines(PLAIN_EVERY_SECONDS, say)
 
 
 def _in_notebook() -> bool:
@@ -48,26 +46,23 @@ def _say_in_place(line: str) -> None:
     print(f"\r{line:<79}", end="", file=sys.stderr, flush=True)
 
 
-class _Lines:
+def _lines(every_seconds: float, show: Callable[[str], None]) -> Observer:
     """Passes a line to `show` every few seconds."""
+    began = last = clock.monotonic()
+    seen = before = 0
 
-    def __init__(self, every_seconds: float, show: Callable[[str], None]) -> None:
-        self.every_seconds, self.show = every_seconds, show
-        self.began = self.last = clock.monotonic()
-        self.done = self.done_before = 0
+    def observer(report: StepReport, trainer: Trainer) -> None:
+        nonlocal began, last, seen, before
+        (done, total), now = trainer.progress(), clock.monotonic()
+        if seen == 0 or done <= seen:  # the first iteration, or that of the next window
+            began, before = now - report.seconds, done - 1
+        seen = done
+        if now - last >= every_seconds or done >= total:
+            last, rate = now, max((done - before) / max(now - began, 1e-9), 1e-9)
+            left = (total - done) / rate
+            show(f"{report.stage.name.lower()} {done}/{total}  {rate:.1f} it/s  {left:.0f} s left  {_facts(report)}")
 
-    def __call__(self, report: StepReport, trainer: Trainer) -> None:
-        done, total = trainer.progress()
-        now = clock.monotonic()
-        if self.done == 0 or done <= self.done:  # the first iteration, or that of the next window
-            self.began, self.done_before = now - report.seconds, done - 1
-        self.done = done
-        if now - self.last < self.every_seconds and done < total:
-            return
-        self.last = now
-        rate = (done - self.done_before) / max(now - self.began, 1e-9)
-        left = (total - done) / max(rate, 1e-9)
-        self.show(f"{report.stage.name.lower()} {done}/{total}  {rate:.1f} it/s  {left:.0f} s left  {_facts(report)}")
+    return observer
 
 
 def _facts(report: StepReport) -> str:
@@ -81,26 +76,14 @@ def _bar() -> Iterator[Observer]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[facts]}"),
-    )
+    stage, rate, facts = (TextColumn(f"{{task.{name}}}") for name in ("description", "fields[rate]", "fields[facts]"))
+    columns = (stage, BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), facts)
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("starting", total=None, rate="", facts="")
 
         def observer(report: StepReport, trainer: Trainer) -> None:
             done, total = trainer.progress()
-            progress.update(
-                task,
-                completed=done,
-                total=total,
-                description=report.stage.name.lower(),
-                rate=f"{1 / max(report.seconds, 1e-9):.0f} it/s",
-                facts=_facts(report),
-            )
+            rate, stage = f"{1 / max(report.seconds, 1e-9):.0f} it/s", report.stage.name.lower()
+            progress.update(task, completed=done, total=total, description=stage, rate=rate, facts=_facts(report))
 
         yield observer

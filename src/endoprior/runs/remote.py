@@ -15,12 +15,10 @@ from ..model.windowed_scene import window_file
 from ..render import ON_GPU
 from ..system.devices import Threads
 from ..system.ray_cluster import Cluster
-from .checkpoint import CHECKPOINT_SECONDS
-from .folder import CONFIG, SCENE
-from .training_run import TrainingRun, WindowedRun, window_config
+from .folder import CHECKPOINT_SECONDS, CONFIG, SCENE
+from .train import TrainingRun, WindowedRun, window_config
 
-RESTARTS = 3
-"""How often a training is resumed after its process died: a machine may be lost, or memory run out."""
+RESTARTS = 3  # how often a training is resumed after its process died: a machine may be lost, or memory run out
 
 
 @dataclass(frozen=True)
@@ -28,34 +26,24 @@ class Training:
     """A training in a folder of its own, as any process can do it that shares the file system."""
 
     name: str
-    data: Path
-    """Sequence folder, absolute."""
+    data: Path  # sequence folder, absolute
     cfg: Config
-    folder: Path
-    """Run folder, absolute."""
-    resume: bool
-    """Whether there must be a run in the folder already. One that is there is resumed in any case."""
+    folder: Path  # run folder, absolute
+    resume: bool  # whether there must be a run in the folder already. One that is there is resumed in any case.
     threads: Threads
     checkpoint_seconds: float = CHECKPOINT_SECONDS
 
     def __str__(self) -> str:
         return self.name
 
-    @property
-    def on_gpu(self) -> bool:
-        """Whether it needs a GPU."""
-        return self.cfg.render.backend in ON_GPU
-
 
 @dataclass(frozen=True)
 class Trained:
     """The result of a training; its scene is in the folder."""
 
-    num_gaussians: int | None
-    """None for a scene that has none."""
+    num_gaussians: int | None  # None for a scene that has none
     seconds: float
-    notes: tuple[str, ...]
-    """Lines for the user about the sequence."""
+    notes: tuple[str, ...]  # lines for the user about the sequence
 
     def __str__(self) -> str:
         count = "" if self.num_gaussians is None else f", {self.num_gaussians:,} Gaussians"
@@ -67,25 +55,17 @@ def trainings(run: TrainingRun | WindowedRun, checkpoint_seconds: float = CHECKP
     assert run.out is not None, "other machines need a folder"
     out, threads = run.out.absolute(), Threads.of_this_process()
     if isinstance(run, TrainingRun):
-        sequence, parts = run.trainer.sequence, [("the whole sequence", run.trainer.cfg, out, run.resume)]
-    else:
-        sequence = run.sequence
-        parts = [
-            (run.window_name(k), window_config(run.cfg, *run.plan[k]), window_file(out / SCENE, k).parent, False)
-            for k in run.waiting(out)
-        ]
-    data = sequence.path.absolute()
-    return [
-        Training(name, data, cfg, folder, resume, threads, checkpoint_seconds) for name, cfg, folder, resume in parts
-    ]
+        data, cfg = run.trainer.sequence.path.absolute(), run.trainer.cfg
+        return [Training("the whole sequence", data, cfg, out, run.resume, threads, checkpoint_seconds)]
+    data, left = run.sequence.path.absolute(), []
+    for k in run.waiting(out):
+        cfg, folder = window_config(run.cfg, *run.plan[k]), window_file(out / SCENE, k).parent
+        left.append(Training(run.window_name(k), data, cfg, folder, False, threads, checkpoint_seconds))
+    return left
 
 
 def train_here(training: Training) -> Trained:
-    """Train in this process, from the last checkpoint if there is one.
-
-    Raises:
-        InputError: see `runs.train`.
-    """
+    """Train in this process, from the last checkpoint if there is one."""
     training.threads.use()
     began, notes = clock.perf_counter(), list[str]()
     resume = training.resume or (training.folder / CONFIG).is_file()
@@ -99,7 +79,7 @@ def train_here(training: Training) -> Trained:
 def start_training_on(cluster: Cluster, key: object, training: Training, cores: int) -> None:
     """Train on a cluster with so many cores; `cluster.next` tells how `key` ended."""
     sent = replace(training, threads=replace(training.threads, numba=cores))
-    cluster.start(key, train_here, sent, cores=cores, on_gpu=training.on_gpu, restarts=RESTARTS)
+    cluster.start(key, train_here, sent, cores=cores, on_gpu=training.cfg.render.backend in ON_GPU, restarts=RESTARTS)
 
 
 def complete_on(
@@ -113,7 +93,7 @@ def complete_on(
     If a window fails, the others are trained nevertheless, so that resuming trains this one only.
 
     Raises:
-        InputError: see `runs.train`.
+        InputError: see `train`.
     """
     if isinstance(run, TrainingRun):
         _train_all(cluster, trainings(run, checkpoint_seconds), say)

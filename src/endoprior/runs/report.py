@@ -25,28 +25,12 @@ from .folder import LOG
 from .log import LOG_EVERY, read_log
 
 SHOWN_SCORES = (
-    "psnr_tissue",
-    "psnr",
-    "ssim",
-    "depth_rmse_mm",
-    "flow_error_dis",
-    "color_share",
-    "depth_instability_mm",
-    "side_psnr",
-    "right_psnr",
-    "psnr_behind_tool",
-    "psnr_behind_tool_seen",
-    "depth_rmse_behind_tool_mm",
-    "track_error_mm",
-    "num_gaussians",
-    "fps",
-    "fps_cached",
-    "train_seconds",
-)
-TURNS_DEG = (-20, -12, 12, 20)
-"""Cameras beside the endoscope's, degrees; above 0 to its right."""
-ERROR_FULL_SCALE = 0.15
-"""Color error, in [0, 1], at the end of the error map's color scale."""
+    "psnr_tissue psnr ssim depth_rmse_mm flow_error_dis color_share depth_instability_mm side_psnr right_psnr "
+    "psnr_behind_tool psnr_behind_tool_seen depth_rmse_behind_tool_mm track_error_mm num_gaussians fps fps_cached "
+    "train_seconds"
+).split()
+TURNS_DEG = (-20, -12, 12, 20)  # cameras beside the endoscope's, degrees; above 0 to its right
+ERROR_FULL_SCALE = 0.15  # color error, in [0, 1], at the end of the error map's color scale
 
 
 def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, title: str = "") -> None:
@@ -54,8 +38,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
 
     Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; the second of
     them from cameras to both sides, and with all that no frame saw hatched; a grid painted on the first frame and
-    carried to the middle and the last one, beside the input; then the training curve, the PSNR of each test frame, and
-    the scores of `metrics.json`. A `title` stands above all.
+    carried on, beside the input; then the training curve, the PSNR of each test frame, and the scores.
     """
     sequence = sequence.with_poses(scene.cameras)
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
@@ -67,7 +50,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=12)
-    top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
+    (top,), (bottom,) = figure.subfigures(2, 1, squeeze=False, height_ratios=[2.1 * len(rows), 3.4])
     for row, cells in zip(top.subplots(len(rows), len(rows[0])), rows, strict=True):
         for axis in row:
             axis.set_axis_off()

@@ -1,26 +1,54 @@
-"""From a sequence to a scene, in memory or in a run folder: in one window or in several."""
+"""From a sequence to a scene: one window or several, in memory or in a run folder. Resuming is bit-identical.
+
+The windows of a sequence are runs of their own, below `windows/` in the run folder.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Callable
-from contextlib import nullcontext
-from dataclasses import fields
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import fields, replace
 from pathlib import Path
 
-from ..core.checks import input_error
+from ..core.checks import input_error, read_ranges
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
 from ..model.method import method_of
 from ..model.scene import RenderedScene
+from ..model.scene_file import load_scene
+from ..model.single_scene import SingleScene
+from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
+from ..system.atomic import write_text, writing
 from ..system.console import complain
-from ..training.preflight import note_on_budget, reject_ignored_options
-from ..training.trainer import Observer
-from .checkpoint import CHECKPOINT_SECONDS
-from .folder import config_of_run, sequence_of_run
+from ..system.memory import freed_memory_kept
+from ..tool_masks.margin import with_tool_margin
+from ..training.divergence import Diverged
+from ..training.preflight import note_on_budget, reject_ignored_options, reject_too_large
+from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
+from . import kernel_cache
+from .folder import (
+    CHECKPOINT,
+    CHECKPOINT_SECONDS,
+    CONFIG,
+    LOG,
+    SCENE,
+    checkpoint_writer,
+    config_of_run,
+    deferred_interrupt,
+    held_folder,
+    load_checkpoint,
+    record_run,
+    reject_unusable_folder,
+    save_checkpoint,
+    sequence_of_run,
+)
+from .log import MARGIN, cut_log, log_writer, read_log
 from .progress import is_watched, training_progress
-from .training_run import TrainingRun, WindowedRun
+
+LAST_GOOD = "last_good.safetensors"  # the scene just before its training diverged
 
 log = logging.getLogger(__name__)
 
@@ -65,15 +93,6 @@ def train(
         return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
 
 
-def _check_reading(sequence: FrameSequence, cfg: Config) -> None:
-    """Raise InputError if the sequence was read in another way than the config says; both eyes are read in any case."""
-    for field in fields(cfg.data):
-        wanted, found = getattr(cfg.data, field.name), getattr(sequence.reading or cfg.data, field.name)
-        if wanted != found and field.name not in ("format", "eyes"):
-            got = f"a sequence that was read with {found!r}"
-            raise input_error(f"data.{field.name}", repr(wanted), got, "`load_sequence(DATA, config.data)`.")
-
-
 def start_run(
     sequence: FrameSequence,
     cfg: Config,
@@ -92,7 +111,11 @@ def start_run(
     reject_ignored_options(cfg)
     if note := note_on_budget(cfg):
         say(f"note: {note}")
-    _check_reading(sequence, cfg)
+    for field in fields(cfg.data):  # was the sequence read as the config says? Both eyes are in any case
+        wanted, found = getattr(cfg.data, field.name), getattr(sequence.reading or cfg.data, field.name)
+        if wanted != found and field.name not in ("format", "eyes"):
+            got = f"a sequence that was read with {found!r}"
+            raise input_error(f"data.{field.name}", repr(wanted), got, "`load_sequence(DATA, config.data)`.")
     if cfg.windows.longest:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
@@ -103,3 +126,176 @@ def start_run(
         if len(plan) > 1:
             return WindowedRun(sequence, cfg, plan, out, resume=resume, say=say)
     return TrainingRun(sequence, cfg, out, resume=resume, say=say)
+
+
+class TrainingRun:
+    """The run of one window, which has been checked and is ready to compute."""
+
+    def __init__(
+        self,
+        sequence: FrameSequence,
+        cfg: Config,
+        out: str | Path | None = None,
+        *,
+        resume: bool = False,
+        say: Callable[[str], None],
+    ) -> None:
+        """Check everything, cheap checks first, and compile the kernels if that was not done before."""
+        self.out, self.resume = Path(out) if out is not None else None, resume
+        if self.out:
+            reject_unusable_folder(self.out, resume=resume)
+        reject_too_large(sequence, cfg)
+        kernel_cache.fill(cfg, say)
+        say(f"{sequence.path}: {len(sequence)} frames; backend {cfg.render.backend}")
+        self.facts: dict[str, int] = {}
+        """What `config.json` says beside what it says of every run."""
+        if cfg.loss.tool_margin == "measured":
+            sequence, margin_px = with_tool_margin(sequence)
+            found = f"tools color {margin_px} px around their masks, which are left out"
+            say(found if margin_px else "tools do not color the pixels around their masks: none is left out")
+            self.facts[MARGIN] = margin_px
+        for warning in sequence.validate():
+            say(f"note: {warning}")
+        self.trainer = method_of(cfg).trainer(sequence, cfg)
+
+    @freed_memory_kept()
+    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> RenderedScene:
+        """Train to the end; `observers` are called after each iteration, in this order. See `train`."""
+        if self.out is None:
+            self.trainer.start()
+            self.trainer.run(list(observers))
+            return self.trainer.scene()
+        out, trainer = self.out, self.trainer
+        fingerprint = trainer.sequence.fingerprint()
+        with held_folder(out, resume=self.resume, begin=lambda: self._begin(out, fingerprint)):
+            self._train_in(out, fingerprint, list(observers), checkpoint_seconds)
+            scene = trainer.scene()
+            scene.save(out / SCENE)
+        return scene
+
+    def _begin(self, out: Path, fingerprint: str) -> None:
+        """Start or restore the trainer, and write what must be known to repeat the run."""
+        trainer, checkpoint = self.trainer, out / CHECKPOINT
+        restored = self.resume and checkpoint.is_file()  # not if it was stopped before its first checkpoint
+        if restored:
+            load_checkpoint(trainer, checkpoint, fingerprint)
+        resume = self.resume and not restored
+        record_run(out, trainer.sequence, trainer.cfg, fingerprint, resume=resume, **self.facts)
+        if not restored:
+            trainer.start()
+        cut_log(out / LOG, trainer.state.stage, trainer.state.iteration)
+
+    def _train_in(self, out: Path, fingerprint: str, observers: list[Observer], checkpoint_seconds: float) -> None:
+        """Iterate to the end or to an interruption, with log and checkpoints in `out`."""
+        trainer, checkpoint, lines = self.trainer, out / CHECKPOINT, out / LOG
+        try:
+            with (
+                writing(lines),
+                open(lines, "a", buffering=1, encoding="utf-8", newline="\n") as file,
+                deferred_interrupt() as interrupted,
+            ):
+                writer = checkpoint_writer(checkpoint, fingerprint, checkpoint_seconds, interrupted)
+                trainer.run([log_writer(file), *observers, writer])
+                save_checkpoint(trainer, checkpoint, fingerprint)
+        except Diverged as error:
+            save_checkpoint(trainer, checkpoint, fingerprint)
+            trainer.scene().save(out / LAST_GOOD)
+            where = f"{trainer.state.stage.name.lower()} iteration {trainer.state.iteration + 1}"
+            raise Diverged(f"{out}: {where}: {error}; the scene before is {LAST_GOOD}.") from error
+
+
+def window_config(cfg: Config, start: int, stop: int) -> Config:
+    """The config of the run of one window: an ordinary training on these frames of what `cfg` reads."""
+    first = min(read_ranges("data.window", cfg.data.window), default=0)
+    data = replace(cfg.data, window=f"{first + start}-{first + stop - 1}")
+    return replace(cfg, data=data, windows=replace(cfg.windows, longest=0))
+
+
+class WindowedRun:
+    """A run of several windows, which are trained one after the other or elsewhere; see `TrainingRun`."""
+
+    def __init__(
+        self,
+        sequence: FrameSequence,
+        cfg: Config,
+        plan: list[tuple[int, int]],
+        out: str | Path | None,
+        *,
+        resume: bool,
+        say: Callable[[str], None],
+    ) -> None:
+        """Check the folder; every window of the `plan`, from first frame to last + 1, is checked when it begins."""
+        self.sequence, self.cfg, self.plan, self.say = sequence, cfg, plan, say
+        self.out, self.resume = Path(out) if out is not None else None, resume
+        if self.out:
+            reject_unusable_folder(self.out, resume=resume)
+        say(f"{sequence.path}: {len(sequence)} frames in {len(plan)} windows")
+
+    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> WindowedScene:
+        """Train every window that is not trained yet. See `TrainingRun.complete`."""
+        if self.out is None:
+            scenes = [self._train(k, None, observers, checkpoint_seconds) for k in range(len(self.plan))]
+            return self._scene(scenes.__getitem__)
+        with self.opened() as out:
+            for k in self.waiting(out):  # one at a time is in memory
+                self._train(k, window_file(out / SCENE, k).parent, observers, checkpoint_seconds)
+            return self.join(out)
+
+    @contextmanager
+    def opened(self) -> Iterator[Path]:
+        """Begin or continue the run in its folder, which no other process can use meanwhile."""
+        assert self.out is not None, "a run in memory has no folder"
+        out = self.out
+
+        def begin() -> None:
+            fingerprint = self.sequence.fingerprint()
+            record_run(out, self.sequence, self.cfg, fingerprint, resume=self.resume, windows=self.plan)
+
+        with held_folder(out, resume=self.resume, begin=begin):
+            yield out
+
+    def waiting(self, out: Path) -> list[int]:
+        """The windows that are not trained yet."""
+        return [k for k in range(len(self.plan)) if not window_file(out / SCENE, k).is_file()]
+
+    def window_name(self, k: int) -> str:
+        """`window 2 of 3: frames 7 to 16`."""
+        start, stop = self.plan[k]
+        return f"window {k + 1} of {len(self.plan)}: frames {start} to {stop - 1}"
+
+    def join(self, out: Path) -> WindowedScene:
+        """Write log and list of the windows, all of which are trained."""
+        files, lines = [window_file(out / SCENE, k) for k in range(len(self.plan))], []
+        for k, file in enumerate(files):
+            lines += [json.dumps({"window": k} | line) + "\n" for line in read_log(file.parent / LOG)]
+        write_text(out / LOG, "".join(lines))
+        scene = self._scene(lambda k: load_scene(files[k]))
+        save_index(out / SCENE, scene)
+        return scene
+
+    def _train(
+        self, k: int, folder: Path | None, observers: Sequence[Observer], checkpoint_seconds: float
+    ) -> RenderedScene:
+        start, stop = self.plan[k]
+        self.say(self.window_name(k))
+        part, cfg = self.sequence.part(start, stop), window_config(self.cfg, start, stop)
+        resume = folder is not None and (folder / CONFIG).is_file()
+        run = TrainingRun(part, cfg, folder, resume=resume, say=self.say)
+        return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
+
+    def _scene(self, read: Callable[[int], RenderedScene]) -> WindowedScene:
+        """Args: read: the scene of window k; one at a time is in memory."""
+
+        def window(k: int) -> SingleScene:
+            scene = read(k)
+            assert isinstance(scene, SingleScene), "only a method of Gaussians trains windows"
+            return scene
+
+        return WindowedScene(
+            config=self.cfg,
+            cameras=tuple(self.sequence.camera(i) for i in range(len(self.sequence))),
+            frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
+            spans=tuple(Span(start, stop, len(window(k))) for k, (start, stop) in enumerate(self.plan)),
+            read=window,
+            lengths_are_relative=self.sequence.depth_is_relative,
+        )

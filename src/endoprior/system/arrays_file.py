@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..core.checks import InputError, input_error
 from .atomic import whole_file
@@ -26,10 +26,8 @@ KEY = "endoprior"
 """The single metadata entry. With several, safetensors writes them in random order, and equal files would differ."""
 DIGEST = "digest"
 """The entry of the metadata with the digest of all others and of the arrays. Earlier versions wrote none."""
-LARGEST_HEADER = 2**20
-"""Largest header (names, shapes, metadata), bytes; normal files have a few thousand."""
-LARGEST_FILE = 2**36
-"""Largest file, bytes; a sparse file could claim any size."""
+LARGEST_HEADER, LARGEST_FILE = 2**20, 2**36
+"""bytes. Normal headers (names, shapes, metadata) have a few thousand; a sparse file could claim any size."""
 DTYPES = {"float32": "F32", "float64": "F64", "int64": "I64", "uint8": "U8"}
 """Names of the types in the file."""
 
@@ -67,9 +65,8 @@ def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, An
         staging = temporary.with_name(f"{temporary.name}.staging")
         staging.mkdir()
         try:
-            file = staging / "arrays"
-            save_file(stored, file, {KEY: text})
-            file.replace(temporary)
+            save_file(stored, staging / "arrays", {KEY: text})
+            (staging / "arrays").replace(temporary)
         finally:
             shutil.rmtree(staging, ignore_errors=True)
 
@@ -89,12 +86,11 @@ def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[di
     from safetensors import SafetensorError, safe_open
 
     expected = " or ".join(formats)
-    with rejecting(path, f"a file of format {expected}", fix, SafetensorError):
+    with rejecting(path, f"a file of format {expected}", fix, SafetensorError, AttributeError):
         _check_size(path)
         with safe_open(path, "pt") as opened:
-            about = _strict_json((opened.metadata() or {})[KEY])
-            digest = about.pop(DIGEST, None)
-            found = about["format"]
+            about = json.loads((opened.metadata() or {})[KEY], parse_constant=_reject_constant)
+            digest, found = about.pop(DIGEST, None), about["format"]
             if not isinstance(found, str) or found not in formats:
                 raise input_error(path, f"format {expected}", f"{found!r:.80}", fix)
             headers = {name: opened.get_slice(name) for name in opened.keys()}
@@ -102,8 +98,10 @@ def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[di
             _match(stored, formats[found](about))
             # Copies: the library's tensors lie in the mapped file, and Windows does not replace a mapped file.
             arrays = {name: opened.get_tensor(name).clone() for name in stored}
-        for name, value in arrays.items():
-            _demand_finite(name, value)
+        for name, value in arrays.items():  # `aminmax` takes one pass and no memory, and propagates NaN
+            is_float = value.is_floating_point() and value.numel()
+            if is_float and not all(bool(end.isfinite()) for end in value.aminmax()):
+                raise InputError(f"expected finite numbers in {name}, got NaN or infinity")
         if digest is not None and digest != _digest(arrays, about):
             raise InputError("expected the bits that were written, got others: the file was damaged or changed")
         return arrays, about
@@ -111,10 +109,9 @@ def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[di
 
 @contextmanager
 def rejecting(path: Path, expected: str, fix: str, *others: type[Exception]) -> Iterator[None]:
-    """Convert all errors that a wrong file can cause, including `others`, to an error message about the file.
+    """Convert all errors that a wrong file can cause, including `others`, to an InputError about the file.
 
-    Raises:
-        InputError: instead of those errors. An InputError passes; the file name is added if it is missing.
+    An InputError passes; the file name is added if it is missing.
     """
     try:
         yield
@@ -124,7 +121,8 @@ def rejecting(path: Path, expected: str, fix: str, *others: type[Exception]) -> 
         problem = str(error).split(". Fix: ")[0].removesuffix(".")
         raise InputError(f"{path}: {problem}. Fix: {fix}") from None
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, OverflowError, RecursionError, *others) as error:
-        raise input_error(path, expected, _one_line(error), fix) from None
+        got = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise input_error(path, expected, got, fix) from None
 
 
 def part(arrays: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -144,16 +142,8 @@ def _check_size(path: Path) -> None:
             raise InputError(f"expected a {name} of at most {largest:,} bytes, got {size:,}")
 
 
-def _strict_json(text: str) -> dict[str, Any]:
-    """A JSON object; NaN and infinity are errors because they are not JSON."""
-
-    def reject(constant: str) -> None:
-        raise ValueError(f"{constant} in the metadata")
-
-    found = json.loads(text, parse_constant=reject)
-    if not isinstance(found, dict):
-        raise ValueError("metadata that is not an object")
-    return found
+def _reject_constant(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} in the metadata, which is not JSON")
 
 
 def _match(stored: Mapping[str, tuple[str, tuple[int, ...]]], schema: Mapping[str, ArraySpec]) -> None:
@@ -180,16 +170,5 @@ def _digest(arrays: Mapping[str, Tensor], about: Mapping[str, Any]) -> str:
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for name, value in sorted(arrays.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.numpy().reshape(-1).view("u1"))
+        digest.update(value.numpy().reshape(-1).view("u1").data)
     return digest.hexdigest()
-
-
-def _demand_finite(name: str, value: Tensor) -> None:
-    """Reject NaN and infinity. `aminmax` takes one pass and no memory, and propagates NaN."""
-    if value.is_floating_point() and value.numel() and not all(bool(end.isfinite()) for end in value.aminmax()):
-        raise InputError(f"expected finite numbers in {name}, got NaN or infinity")
-
-
-def _one_line(error: Exception) -> str:
-    """Type and message of an error, shortened to one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

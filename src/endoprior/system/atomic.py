@@ -43,11 +43,7 @@ class CannotWrite(InputError):
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert disk errors to an error message about `path`; other errors pass.
-
-    Raises:
-        CannotWrite: the disk is full, over a limit, read-only or broken.
-    """
+    """Raise CannotWrite for `path` if the disk is full, over a limit, read-only or broken; other errors pass."""
     try:
         yield
     except Exception as error:
@@ -62,14 +58,14 @@ def writing(path: Path) -> Iterator[None]:
 
 def _disk_error(error: Exception, path: Path) -> str | None:
     """The system's message if `error` is, or wraps, a disk error; else None."""
-    number = error.errno if isinstance(error, OSError) else None
     named_file = getattr(error, "filename", None)
     if named_file and path.absolute().parent not in Path(os.fsdecode(named_file)).absolute().parents:
         return None  # an error of a file that was read
+    number = error.errno if isinstance(error, OSError) else None
     if number is None and (match := re.search(r"os error (\d+)", str(error))):  # from a library in Rust
         number = int(match[1])
     if number in DISK_ERRORS:
-        return os.strerror(number)
+        return os.strerror(number or 0)
     with suppress(OSError):
         # Video encoders report no reason.
         if shutil.disk_usage(path.absolute().parent).free < FULL_BYTES:
@@ -81,16 +77,16 @@ def _disk_error(error: Exception, path: Path) -> str | None:
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling of `path` to write to; rename it to `path` on success, remove it on failure.
 
-    The content is flushed before the rename, so that even a power cut never leaves a partial file at `path`.
-
-    Raises:
-        CannotWrite: the disk rejects the file.
+    The content is flushed before the rename, so that even a power cut never leaves a partial file at `path`. Raises
+    CannotWrite if the disk rejects the file.
     """
     temporary = temporary_sibling(path)
     try:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            usual = _usual_mode(temporary)
+            temporary.touch()
+            usual = temporary.stat().st_mode  # some libraries create files without group permissions
+            temporary.unlink()
             yield temporary
             os.chmod(temporary, usual)
             _flush_file(temporary)
@@ -105,9 +101,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 def whole_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling folder of `path`; rename it to `path` on success, remove it on failure.
 
-    Raises:
-        InputError: `path` is not empty, or the folder cannot be created.
-        CannotWrite: the disk rejects a file.
+    Raises InputError if `path` is not empty or cannot be created, CannotWrite if the disk rejects a file.
     """
     reject_current_folder(path)
     reject_occupied(path)
@@ -139,11 +133,7 @@ def removed_on_failure(folder: Path) -> Iterator[None]:
 
 
 def complete_folder(temporary: Path, path: Path) -> None:
-    """Flush all files of a folder to the disk, then rename it to `path`.
-
-    Raises:
-        InputError: `path` is not empty.
-    """
+    """Flush all files of a folder to the disk, then rename it to `path`; InputError if that is not empty."""
     reject_occupied(path)
     for place, _, files in os.walk(temporary):
         for name in files:
@@ -155,16 +145,7 @@ def complete_folder(temporary: Path, path: Path) -> None:
     _flush_entries(path.absolute().parent)
 
 
-def _usual_mode(path: Path) -> int:
-    """Default permissions of a new file at `path`; some libraries create files without group permissions."""
-    path.touch()
-    mode = path.stat().st_mode
-    path.unlink()
-    return mode
-
-
 def _flush_file(path: Path) -> None:
-    """Flush the content of a file to the disk."""
     with open(path, "r+b") as file:  # Windows only flushes files that are open for writing
         os.fsync(file.fileno())
 
@@ -201,13 +182,8 @@ def reject_current_folder(path: Path) -> None:
         raise input_error(path, "the name of a new folder", "one that is in use", "Choose a new name in this folder.")
 
 
-def reject_occupied(path: Path, alternative: str = "", *, ignore: Callable[[Path], bool] = lambda file: False) -> None:
-    """Raise InputError unless `path` does not exist yet or is an empty folder.
-
-    Args:
-        alternative: another possible fix, appended to the message.
-        ignore: says which files may exist.
-    """
+def reject_occupied(path: Path, alternative: str = "", *, ignore: Callable[[Path], bool] = lambda _: False) -> None:
+    """Raise InputError, with `alternative` behind its fix, unless `path` is new or a folder of what to `ignore`."""
     try:
         if path.is_dir() and not all(map(ignore, path.iterdir())):
             found = "one with files in it"
@@ -269,14 +245,10 @@ def _machine() -> str:
     try:
         known = Path("/proc/sys/kernel/random/boot_id").read_text("ascii") + os.readlink("/proc/self/ns/pid")
     except OSError:
-        known = uuid.uuid4().hex if sys.platform == "linux" else _minute_of_boot()
+        import psutil
+
+        known = uuid.uuid4().hex if sys.platform == "linux" else str(round(psutil.boot_time() / 60))
     return hashlib.sha256(f"{socket.gethostname()} {known}".encode()).hexdigest()[:12]
-
-
-def _minute_of_boot() -> str:
-    import psutil
-
-    return str(round(psutil.boot_time() / 60))
 
 
 def lies_in(path: Path, folder: Path) -> bool:

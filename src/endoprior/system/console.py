@@ -10,19 +10,14 @@ from ..core.checks import input_error, printable
 
 
 def say(text: str) -> None:
-    """Print one line on stdout and flush it. If its reader has gone, `head` for instance, the work still goes on.
-
-    Raises:
-        InputError: stdout is a file on a disk that is full or broken.
-    """
+    """Print one line on stdout and flush it. If its reader has gone, `head` for instance, the work still goes on."""
     try:
         print(printable(text), flush=True)
-    except BrokenPipeError:  # what was not read, and all later lines, go nowhere
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        got = error.strerror or str(error)
-        raise input_error("standard output", "a file that takes text", got, "free space, then repeat.") from error
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # where all later lines go
+        if not isinstance(error, BrokenPipeError):  # a disk that is full or broken
+            got = error.strerror or str(error)
+            raise input_error("standard output", "a file that takes text", got, "free space, then repeat.") from error
 
 
 def complain(text: str, end: str = "\n") -> None:

@@ -48,7 +48,9 @@ class Threads:
     def use(self) -> None:
         """Compute with these from now on; Numba with no more than it started with."""
         import numba
+        import numba.core.config
         import torch
 
-        numba.set_num_threads(min(self.numba, numba.config.NUMBA_NUM_THREADS))
+        started_with: int = getattr(numba.core.config, "NUMBA_NUM_THREADS")  # noqa: B009  # set by a function of Numba
+        numba.set_num_threads(min(self.numba, started_with))
         torch.set_num_threads(self.torch)

@@ -25,10 +25,7 @@ def exclusive(file: Path, seconds: float = 0.0) -> Iterator[None]:
     only if it ran on the same machine, since its last start, and in the same container: of others it is not known.
 
     Args:
-        seconds: how long to wait for it.
-    Raises:
-        Timeout: another process has the lock.
-        OSError: it cannot be created.
+        seconds: how long to wait for it; then `filelock.Timeout`.
     """
     lock, existed = FileLock(file, fallback_to_soft=False), file.exists()
     try:
@@ -51,11 +48,7 @@ def exclusive(file: Path, seconds: float = 0.0) -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path, file: Path) -> Iterator[None]:
-    """Hold the lock `file`, so that no second process writes `folder`; see `exclusive`.
-
-    Raises:
-        InputError: another process has the lock, or it cannot be created.
-    """
+    """Hold the lock `file`, so that no second process writes `folder`; InputError if that is not possible."""
     with ExitStack() as stack:
         try:
             stack.enter_context(exclusive(file))

@@ -20,21 +20,16 @@ def source_commit() -> str | None:
     if STAMP.is_file():
         return STAMP.read_text(encoding="utf-8").strip()
     try:
-        commit = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
-            cwd=PACKAGE,
-            capture_output=True,
-            encoding="utf-8",
-            timeout=10,
-            check=True,
-        )
         # An installed package can lie inside somebody else's checkout: only a tracked file speaks for its repository.
-        subprocess.run(
-            ["git", "ls-files", "--error-unmatch", __file__], cwd=PACKAGE, capture_output=True, timeout=10, check=True
-        )
+        _git("ls-files", "--error-unmatch", __file__)
+        return _git("describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*")
     except (OSError, subprocess.SubprocessError):
         return None
-    return commit.stdout.strip()
+
+
+def _git(*words: str) -> str:
+    options = {"cwd": PACKAGE, "capture_output": True, "timeout": 10, "check": True}
+    return subprocess.run(["git", *words], encoding="utf-8", **options).stdout.strip()
 
 
 def docs_folder() -> Path:

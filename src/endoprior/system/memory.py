@@ -8,16 +8,16 @@ import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Generic, TypeVar
 
 from ..core.checks import input_error
 
 CACHE_SHARE = 0.1
-"""Size of each frame cache, as a share of the free memory at its creation ..."""
 LEAST_CACHE, LARGEST_CACHE = 256 * 2**20, 512 * 2**20
-"""... but at least and at most so many bytes: a window of a long sequence fits, and memory does not grow."""
+"""Size of each frame cache: a share of the free memory at its creation, but at least and at most so many bytes. So a
+window of a long sequence fits, and memory does not grow."""
 LEAST_DATA, LEAST_SPACE = 600 * 2**20, 1500 * 2**20
 """Writable memory and address space that the libraries alone need, bytes (docs/reliability.md)."""
 VARIABLE = "ENDOPRIOR_CACHE_GB"
@@ -34,9 +34,12 @@ Value = TypeVar("Value")
 
 def available_bytes() -> int | None:
     """Memory that this process can still allocate: limits of system, container and process; None if unknown."""
-    found = [_free_in_system(), _left_in_container(), _left_of_limit()]
-    known = [value for value in found if value is not None]
-    return max(min(known), 0) if known else None
+    import psutil
+
+    left = [*_left_in_container(), *_left_of_limits()]
+    with suppress(OSError, ValueError, psutil.Error):  # Linux without /proc
+        left.append(psutil.virtual_memory().available)
+    return max(min(left), 0) if left else None
 
 
 def cache_bytes() -> int:
@@ -48,11 +51,7 @@ def cache_bytes() -> int:
 
 
 def reject_small_limits() -> None:
-    """Reject process limits that are too small to load the libraries; some libraries would hang.
-
-    Raises:
-        InputError: names the limit and the required value.
-    """
+    """Raise InputError for process limits that are too small to load the libraries; some of them would hang."""
     try:
         import resource
     except ImportError:  # the system has no such limits
@@ -68,12 +67,7 @@ class BoundedCache(Generic[Value]):
     """A least-recently-used cache of bounded size in bytes. Thread-safe."""
 
     def __init__(self, limit_bytes: int, size_of: Callable[[Value], int]) -> None:
-        """Start empty.
-
-        Args:
-            limit_bytes: total size; the newest value always stays.
-            size_of: returns the size of a value in bytes.
-        """
+        """Args: limit_bytes: total size; the newest value always stays. size_of: the size of a value in bytes."""
         self._limit, self._size_of = limit_bytes, size_of
         self._values: OrderedDict[Hashable, Value] = OrderedDict()
         self._bytes = 0
@@ -99,40 +93,27 @@ class BoundedCache(Generic[Value]):
             return self._values.get(key, value)
 
 
-def _free_in_system() -> int | None:
-    import psutil
-
-    try:
-        return psutil.virtual_memory().available
-    except (OSError, ValueError, psutil.Error):  # Linux without /proc
-        return None
-
-
-def _left_in_container() -> int | None:
+def _left_in_container() -> Iterator[int]:
+    folder = Path("/sys/fs/cgroup")
     for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
     ):
-        try:
-            return int(Path(limit).read_text("ascii")) - int(Path(used).read_text("ascii"))
-        except (OSError, ValueError):  # no such group, or no limit
-            continue
-    return None
+        with suppress(OSError, ValueError):  # no such group, or no limit
+            yield int((folder / limit).read_text("ascii")) - int((folder / used).read_text("ascii"))
 
 
-def _left_of_limit() -> int | None:
+def _left_of_limits() -> Iterator[int]:
     """Rest of the limits on address space (`ulimit -v`) and writable memory (`ulimit -d`)."""
-    try:
+    with suppress(ImportError, OSError, ValueError):
         import resource
 
         lines = (line.split() for line in Path("/proc/self/status").read_text("utf-8").splitlines())
         used = {words[0]: int(words[1]) * 1024 for words in lines if words and words[0] in ("VmSize:", "VmData:")}
-        limits = {"VmSize:": resource.RLIMIT_AS, "VmData:": resource.RLIMIT_DATA}
-        soft = {name: resource.getrlimit(kind)[0] for name, kind in limits.items()}
-    except (ImportError, OSError, ValueError):
-        return None
-    left = [limit - used[name] for name, limit in soft.items() if limit != resource.RLIM_INFINITY and name in used]
-    return min(left, default=None)
+        for name, kind in (("VmSize:", resource.RLIMIT_AS), ("VmData:", resource.RLIMIT_DATA)):
+            limit = resource.getrlimit(kind)[0]
+            if limit != resource.RLIM_INFINITY and name in used:
+                yield limit - used[name]
 
 
 def workers(bytes_each: int) -> int:
@@ -150,24 +131,15 @@ def freed_memory_kept() -> Iterator[None]:
     anew each time, and the system clears every page at its first use: a quarter to half of the time of an iteration of
     radiance fields (docs/log.md). Its setting for the limit does not go higher, so mapping is switched off.
     """
-    library = _library()
-    if library is None:
+    library = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if library is None or not (hasattr(library, "mallopt") and hasattr(library, "malloc_trim")):
         yield
         return
-    _set(library, KEPT)
+    for setting in KEPT.items():
+        library.mallopt(*setting)
     try:
         yield
     finally:
-        _set(library, USUAL)
+        for setting in USUAL.items():
+            library.mallopt(*setting)
         library.malloc_trim(0)
-
-
-def _library() -> ctypes.CDLL | None:
-    """The C library, if it has these settings."""
-    library = ctypes.CDLL(None) if sys.platform == "linux" else None
-    return library if hasattr(library, "mallopt") and hasattr(library, "malloc_trim") else None
-
-
-def _set(library: ctypes.CDLL, settings: dict[int, int]) -> None:
-    for name, value in settings.items():
-        library.mallopt(name, value)

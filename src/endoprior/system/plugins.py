@@ -7,7 +7,6 @@ asks for it by name ends with an error.
 from __future__ import annotations
 
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -26,14 +25,14 @@ OWN_PACKAGE = "endoprior"
 class Plugin:
     """An entry point of an installed package."""
 
-    kind: str
-    """What it is, such as `methods`; the group of its entry point is `endoprior.KIND`."""
-    name: str
-    """What options and specs call it."""
-    target: str
-    """What it stands for, `module` or `module:object`."""
+    entry: EntryPoint
     package: str
     version: str
+
+    @property
+    def name(self) -> str:
+        """What options and specs call it."""
+        return self.entry.name
 
     @property
     def origin(self) -> str:
@@ -42,12 +41,12 @@ class Plugin:
 
     def rejected(self, expected: str, got: str, fix: str) -> InputError:
         """The error for this plugin, on one line."""
-        subject = f"plugin {self.name} of {self.origin} ({self.target})"
+        subject = f"plugin {self.name} of {self.origin} ({self.entry.value})"
         return input_error(subject, expected, " ".join(got.split()), fix)
 
     def words_for(self, error: BaseException) -> str:
         """An error inside this plugin on one line: `KeyError: 'x' (FILE:LINE)`, the last place in its own package."""
-        package = self.target.partition(":")[0].partition(".")[0]
+        package = self.entry.module.partition(".")[0]
         frames = traceback.walk_tb(error.__traceback__)
         own = [(f, line) for f, line in frames if f.f_globals.get("__name__", "").partition(".")[0] == package]
         if isinstance(error, SyntaxError) and error.filename:  # raised before a frame of the file exists
@@ -59,10 +58,11 @@ class Plugin:
 
 @cache
 def installed(kind: str) -> tuple[Plugin, ...]:
-    """The plugins of a kind, by name and package; none is imported."""
+    """The plugins of a kind, such as `methods`: entry points of the group `endoprior.KIND`, none of them imported."""
     found = [
-        Plugin(kind, entry.name, entry.value, entry.dist.name, entry.dist.version)
+        Plugin(entry, entry.dist.name, entry.dist.version)
         for entry in entry_points(group=f"endoprior.{kind}")
+        if entry.dist
     ]
     return tuple(sorted(found, key=lambda plugin: (plugin.name, plugin.package)))
 
@@ -73,50 +73,36 @@ def report(error: str) -> None:
     complain(f"endoprior: {error}")
 
 
+@dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Everything of one kind by name: what is built in, and what plugins add."""
+    """Everything of one kind by name: what is built in, and what plugins add. Nothing is imported before it is used."""
 
-    def __init__(
-        self,
-        kind: str,
-        expected: str,
-        problem: Callable[[Any], str],
-        *,
-        modules: tuple[str, ...] = (),
-        load_module: Callable[[str], T] | None = None,
-        reserved: tuple[str, ...] = (),
-    ) -> None:
-        """Describe a kind; nothing is imported yet.
-
-        Args:
-            kind: see `Plugin.kind`.
-            expected: what an entry point must stand for, for messages.
-            problem: what is wrong with the object that an entry point stands for; empty if nothing is.
-            modules: built-in names that need no entry point.
-            load_module: gives the one of such a name.
-            reserved: names with a meaning of their own, which no plugin can have.
-        """
-        self.kind, self.reserved = kind, reserved
-        self._modules, self._load_module, self._expected, self._problem = modules, load_module, expected, problem
+    kind: str
+    """See `installed`."""
+    expected: str
+    """What an entry point must stand for, for messages."""
+    problem: Callable[[Any], str]
+    """What is wrong with the object that an entry point stands for; empty if nothing is."""
+    modules: tuple[str, ...] = ()
+    """Built-in names that need no entry point."""
+    load_module: Callable[[str], T] | None = None
+    """Gives the one of such a name."""
+    reserved: tuple[str, ...] = ()
+    """Names with a meaning of their own, which no plugin can have."""
 
     @property
     def builtin(self) -> tuple[str, ...]:
         """The names that come with this package."""
-        return (*self._modules, *(plugin.name for plugin in installed(self.kind) if plugin.package == OWN_PACKAGE))
+        return (*self.modules, *(plugin.name for plugin in installed(self.kind) if plugin.package == OWN_PACKAGE))
 
     def names(self) -> tuple[str, ...]:
         """The built-in names, then those of plugins. Plugins whose name is taken are reported and left out."""
         return (*self.builtin, *(name for name in self._plugins() if name not in self.builtin))
 
     def load(self, name: str) -> T:
-        """The one of that name in `names()`.
-
-        Raises:
-            InputError: it is a plugin that cannot be used; the message names package and object.
-            KeyError: there is none.
-        """
-        if name in self._modules and self._load_module:
-            return self._load_module(name)
+        """The one of that name in `names()`; InputError for a plugin that cannot be used, KeyError if there is none."""
+        if name in self.modules and self.load_module:
+            return self.load_module(name)
         return self.loaded(self._plugins()[name])
 
     def usable(self) -> Iterator[tuple[str, T]]:
@@ -133,23 +119,20 @@ class Registry(Generic[T]):
 
     def failure(self, name: str, error: Exception) -> str:
         """What to say of an error inside a plugin: `mae of endoprior-example 0.1 failed: KeyError: 'x' (mae.py:9)`."""
-        return f"{name} of {self.origin(name)} failed: {self._plugins()[name].words_for(error)}"
+        plugin = self._plugins()[name]
+        return f"{name} of {plugin.origin} failed: {plugin.words_for(error)}"
 
     def loaded(self, plugin: Plugin) -> T:
-        """Import a plugin of this kind and check that it is what it promises.
-
-        Raises:
-            InputError: its name is taken, importing it fails, or it is something else.
-        """
+        """Import a plugin; InputError if its name is taken, importing it fails, or it is not what it should be."""
         self._demand_free_name(plugin)
         fix = f"update or uninstall {plugin.package}."
         try:
-            found = EntryPoint(plugin.name, plugin.target, f"endoprior.{self.kind}").load()
-            problem = self._problem(found)
+            found = plugin.entry.load()
+            problem = self.problem(found)
         except (Exception, SystemExit) as error:  # code of others: anything can happen
-            raise plugin.rejected(self._expected, plugin.words_for(error), fix) from error
+            raise plugin.rejected(self.expected, plugin.words_for(error), fix) from error
         if problem:
-            raise plugin.rejected(self._expected, problem, fix)
+            raise plugin.rejected(self.expected, problem, fix)
         return found
 
     def _plugins(self) -> dict[str, Plugin]:
@@ -169,6 +152,7 @@ class Registry(Generic[T]):
             return
         if plugin.name in (*self.builtin, *self.reserved):
             raise plugin.rejected("a name of its own", "that of a built-in one", f"uninstall {plugin.package}.")
-        if Counter(other.name for other in installed(self.kind))[plugin.name] > 1:
-            packages = ", ".join(other.package for other in installed(self.kind) if other.name == plugin.name)
-            raise plugin.rejected("a name of its own", f"one name in {packages}", "uninstall all but one.")
+        packages = [other.package for other in installed(self.kind) if other.name == plugin.name]
+        if len(packages) > 1:
+            got = f"one name in {', '.join(packages)}"
+            raise plugin.rejected("a name of its own", got, "uninstall all but one.")

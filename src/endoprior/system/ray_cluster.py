@@ -11,7 +11,8 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ..core.checks import input_error
@@ -30,29 +31,21 @@ HOST_AND_PORT = re.compile(r"(?:ray://)?\[?([^/\]]+)\]?:(\d+)")
 
 @dataclass(frozen=True)
 class Ended:
-    """How a call ended."""
+    """How a call ended: what the function returned or raised, or why its process died, too often."""
 
     key: Any
     """What `Cluster.start` was given."""
     value: Any = None
-    """What the function returned."""
     error: Exception | None = None
-    """What it raised; or why its process died, too often."""
-
-
-@dataclass(frozen=True)
-class _Call:
-    key: Any
-    remote: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    restarts: int
 
 
 class Cluster:
     """Calls that run on a cluster, as many at a time as it has cores for. See `connected`."""
 
     def __init__(self, ray: Any, say: Callable[[str], None]) -> None:
-        self._ray, self._say, self._running = ray, say, dict[Any, _Call]()
+        self._ray, self._say = ray, say
+        self._running = dict[Any, tuple[Any, Callable[[], Any], int]]()
+        """Key, how to call it again, and how often, by Ray's reference."""
         self.interrupted = False
         """Whether a signal asked to stop."""
 
@@ -82,15 +75,14 @@ class Cluster:
             function: of a module of this program, which every machine has.
             on_gpu: it also needs a GPU of its own.
             restarts: how often it is called again if its process dies.
-        Raises:
-            InputError: no machine has so many cores, or none has a GPU.
         """
         if cores > (most := max(self._cores())):
             raise input_error("--ray", f"a machine with {cores} cores", f"at most {most}", "ask for fewer cores.")
         if on_gpu and not self._ray.cluster_resources().get("GPU"):
             raise input_error("--ray", "a cluster with a GPU", "none", "add `--device cpu`.")
         options = {"num_cpus": cores, "max_retries": 0} | ({"num_gpus": 1} if on_gpu else {})
-        self._submit(_Call(key, self._ray.remote(**options)(function).remote, arguments, restarts))
+        submit = partial(self._ray.remote(**options)(function).remote, *arguments)
+        self._running[submit()] = key, submit, restarts
 
     def next(self) -> Ended:
         """Wait for a call to end. One whose process dies is called again, as often as it may be."""
@@ -101,23 +93,22 @@ class Cluster:
                 if self.interrupted:
                     raise KeyboardInterrupt
                 ended, _ = self._ray.wait(list(self._running), num_returns=1, timeout=SIGNAL_SECONDS)
-            (reference,) = ended
-            call = self._running.pop(reference)
+            key, submit, restarts = self._running.pop(ended[0])
             try:
-                return Ended(call.key, self._ray.get(reference))
+                return Ended(key, self._ray.get(ended[0]))
             except errors.RayTaskError as error:
                 cause = getattr(error, "cause", None)
                 if not isinstance(cause, Exception):
-                    return Ended(call.key, error=error)
+                    return Ended(key, error=error)
                 cause.__cause__ = error  # which tells where it was raised
-                return Ended(call.key, error=cause)
+                return Ended(key, error=cause)
             except errors.RayError as error:
                 lines = [line for line in str(error).splitlines() if line.strip()]
                 reason = lines[0].partition(". ")[0].rstrip(".")[:160] if lines else type(error).__name__
-                if not call.restarts:
-                    return Ended(call.key, error=RuntimeError(f"Ray: {reason}"))
-                self._say(f"{call.key}: its process died and is started again ({reason})")
-                self._submit(replace(call, restarts=call.restarts - 1))
+                if not restarts:
+                    return Ended(key, error=RuntimeError(f"Ray: {reason}"))
+                self._say(f"{key}: its process died and is started again ({reason})")
+                self._running[submit()] = key, submit, restarts - 1
 
     def interrupt(self) -> None:
         """Interrupt every call, like Ctrl-C, and wait until all have saved their state and ended."""
@@ -125,9 +116,6 @@ class Cluster:
             for reference in self._running:
                 self._ray.cancel(reference)
             self._ray.wait(list(self._running), num_returns=len(self._running), timeout=SAVE_SECONDS)
-
-    def _submit(self, call: _Call) -> None:
-        self._running[call.remote(*call.arguments)] = call
 
     def _cores(self) -> list[int]:
         """Cores of each machine that has any."""
@@ -140,11 +128,6 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
     """Connect to a Ray cluster; `local` starts one on this machine, `auto` finds one that runs here.
 
     If the body raises, all calls are interrupted. SIGTERM and SIGHUP count as Ctrl-C.
-
-    Args:
-        say: takes lines for the user.
-    Raises:
-        InputError: Ray is not installed, or the cluster cannot be reached.
     """
     if address == "local" and "ray" not in sys.modules and "RAY_AUTH_MODE" not in os.environ:
         # It listens on all addresses of this machine, and runs what it is sent by whoever has the token.
@@ -160,7 +143,8 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
     job = ray.job_config.JobConfig()
     job._client_job = True
     try:
-        _reject_silent(address)
+        if named := HOST_AND_PORT.fullmatch(address):  # Ray would wait for minutes, then end the process
+            socket.create_connection((named[1], int(named[2])), CONNECT_SECONDS).close()
         ray.init(
             address=address,
             log_to_driver=False,
@@ -174,8 +158,13 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
         got = "none" if is_silent else " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise input_error(f"--ray {address}", "a running cluster", got[:200], fix) from error
     cluster = Cluster(ray, say)
+
+    def interrupt(_signum: int, _frame: Any) -> None:
+        cluster.interrupted = True  # what is raised here can be lost inside of Ray
+        raise KeyboardInterrupt
+
     try:
-        with _interrupted_by_signals(cluster):
+        with handled_by(interrupt):  # Ray ends the process on the first signal of a scheduler or closing terminal
             try:
                 yield cluster
             except BaseException:
@@ -183,24 +172,3 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
                 raise
     finally:
         ray.shutdown()
-
-
-def _reject_silent(address: str) -> None:
-    """Raise OSError if the machine of an address does not answer: Ray would wait for minutes, then end the process."""
-    if named := HOST_AND_PORT.fullmatch(address):
-        socket.create_connection((named[1], int(named[2])), CONNECT_SECONDS).close()
-
-
-@contextmanager
-def _interrupted_by_signals(cluster: Cluster) -> Iterator[None]:
-    """Treat the signals of schedulers and closing terminals as Ctrl-C: Ray ends the process on the first.
-
-    What a handler raises can be lost inside of Ray, so `Cluster.interrupted` remembers it.
-    """
-
-    def interrupt(signum: int, frame: Any) -> None:
-        cluster.interrupted = True
-        raise KeyboardInterrupt
-
-    with handled_by(interrupt):
-        yield

@@ -41,7 +41,7 @@ def all_interrupt() -> AbstractContextManager[None]:
     """Let each of these signals raise KeyboardInterrupt, so that what is cleaned up after Ctrl-C always is."""
     last = -REPEAT_S
 
-    def interrupt(signum: int, frame: Any) -> None:
+    def interrupt(signum: int, _frame: Any) -> None:
         nonlocal last
         before, last = last, clock.monotonic()
         if signum == signal.SIGINT or last - before >= REPEAT_S:

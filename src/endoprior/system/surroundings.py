@@ -11,6 +11,8 @@ from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import CodeType, ModuleType
 from typing import Any
 
+from typing_extensions import override
+
 from ..core.checks import input_error
 
 MOST_THREADS = 1024
@@ -57,6 +59,7 @@ class _WithoutFile(SourceFileLoader):
 
 
 class _Finder(MetaPathFinder):
+    @override
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:

@@ -16,38 +16,28 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.ranges import spread
 from ..data import FrameSequence
-from .examples import Classifier, Examples, clicked_region, examples_of, fit
-from .feature_maps import feature_map
+from ..footage.components import Mask, large_regions
+from .examples import Examples, clicked_region, examples_of, feature_map, fit, probability
 from .finder import ToolFinder, full_size, network_image, small_view
-from .logistic import probability
 from .regions import tool_regions
 from .sequence import SAMPLES, view_of
 
-TAUGHT = 12
-"""Number of frames, besides the clicked ones, from which examples are taken."""
+TAUGHT = 12  # Number of frames, besides the clicked ones, from which examples are taken
 LEAST_PART_PX = 30
 """Smaller parts are left out: pieces of the rims of known tools, which would change the masks of all frames."""
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class ToolClick:
     """A click on a tool that the masks miss."""
 
-    frame: int
-    """Its place in the sequence, from 0."""
-    x: float
-    """px of the image, 0 at its left edge."""
-    y: float
-    """px of the image, 0 at its upper edge."""
+    frame: int  # Its place in the sequence, from 0
+    x: float  # px of the image, 0 at its left edge
+    y: float  # px of the image, 0 at its upper edge
 
 
 def parse_click(text: str, option: str) -> ToolClick:
-    """A click from `FRAME,X,Y`.
-
-    Raises:
-        InputError: the text has another form.
-    """
+    """A click from `FRAME,X,Y`; InputError for a text of another form."""
     try:
         frame, x, y = text.split(",")
         return ToolClick(int(frame), float(x), float(y))
@@ -60,25 +50,17 @@ class SearchStep:
     """What is known after each frame of a search."""
 
     done: int
-    total: int
-    """Frames of both passes: those that teach, and all."""
-    frame: int | None = None
-    """The frame that was searched; None while examples are gathered."""
-    added: Mask | None = None
-    """(H, W) True on tools that its mask misses."""
+    total: int  # Frames of both passes: those that teach, and all
+    frame: int | None = None  # The frame that was searched; None while examples are gathered
+    added: Mask | None = None  # (H, W) True on tools that its mask misses
 
 
 def find_clicked(
     sequence: FrameSequence, clicks: Sequence[ToolClick], tool: Callable[[int], Mask], finder: ToolFinder | None = None
 ) -> Iterator[SearchStep]:
-    """Find the clicked tools in every frame, one frame a step.
-
-    Args:
-        clicks: at least one.
-        tool: gives the mask (H, W) of a frame, True on everything that is not tissue.
-        finder: in place of the one that comes with the program.
-    Raises:
-        InputError: a click is in no frame, outside of the image, or on a mask; before the first step.
+    """Find the clicked tools in every frame, one frame a step. `tool` gives the mask (H, W) of a frame, True on
+    everything that is not tissue. InputError before the first step for a click in no frame, outside of the image, or on
+    a mask.
     """
     check_clicks(sequence, clicks, tool)
     return _steps(sequence, clicks, tool, finder or ToolFinder())
@@ -106,61 +88,39 @@ def _steps(
 ) -> Iterator[SearchStep]:
     count = len(sequence)
     view = view_of([sequence.frame(i) for i in spread(count, SAMPLES)])
+    small = small_view(view)
+
+    def look(index: int) -> tuple[NDArray[np.float32], Mask]:
+        """The features (h, w, k) of a frame, and (h, w) True on its masked tools."""
+        rgb_u8, known = sequence.frame(index).rgb_u8, (tool(index) & view).astype(np.float32)
+        known = cv2.resize(known, small.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
+        return feature_map(finder.log_odds(rgb_u8, view), network_image(rgb_u8, view)), known
+
     taught = sorted({*spread(count, TAUGHT), *(click.frame for click in clicks)})
     total, regions, examples = len(taught) + count, dict[int, Mask](), list[Examples]()
     for done, i in enumerate(taught, 1):
-        features, known = _look(sequence, i, tool, finder, view)
-        here = [clicked_region(features, small_view(view) & ~known, spot) for spot in _spots(clicks, i, known, view)]
-        clicked = np.any([np.zeros_like(known), *here], axis=0)
+        features, known = look(i)
+        free = small & ~known
+        here = [spot for click in clicks if click.frame == i and (spot := _spot(click, free, view.shape))]
+        clicked = np.any([np.zeros_like(known), *(clicked_region(features, free, spot) for spot in here)], axis=0)
         if here:
             regions[i] = clicked
-        examples.append(examples_of(features, small_view(view), known, clicked))
+        examples.append(examples_of(features, small, known, clicked))
         yield SearchStep(done, total)
     classifier = fit(examples)
     for i in range(count):
-        features, known = _look(sequence, i, tool, finder, view)
-        found = found_parts(features, small_view(view), known, classifier) | regions.get(i, False)
-        added = full_size(found, view.shape) & view & ~tool(i)
-        yield SearchStep(len(taught) + i + 1, total, i, added)
+        features, known = look(i)
+        # Known tools count as certain, so that a part which touches one enters the view with it.
+        found = np.where(known, 1, probability(classifier.log_odds(features)) * small).astype(np.float32)
+        parts = large_regions(tool_regions(found, small) & ~known, LEAST_PART_PX) | regions.get(i, False)
+        yield SearchStep(len(taught) + i + 1, total, i, full_size(parts, view.shape) & view & ~tool(i))
 
 
-def found_parts(features: NDArray[np.float32], view: Mask, known: Mask, classifier: Classifier) -> Mask:
-    """(h, w) what the classifier finds beside the known tools of a frame.
-
-    Known tools count as certain, so that a part which touches one enters the view with it.
-
-    Args:
-        features: (h, w, k).
-        view, known: (h, w) True inside the endoscope's image, and on tools that are masked.
-    """
-    found = np.where(known, 1, probability(classifier.log_odds(features)) * view).astype(np.float32)
-    parts = (tool_regions(found, view) & ~known).astype(np.uint8)
-    _, label, stats, _ = cv2.connectedComponentsWithStats(parts, connectivity=8)
-    keep = stats[:, cv2.CC_STAT_AREA] >= LEAST_PART_PX
-    keep[0] = False
-    return keep[label]
-
-
-def _look(
-    sequence: FrameSequence, index: int, tool: Callable[[int], Mask], finder: ToolFinder, view: Mask
-) -> tuple[NDArray[np.float32], Mask]:
-    """The features (h, w, k) of a frame, and (h, w) True on its masked tools."""
-    rgb_u8 = sequence.frame(index).rgb_u8
-    log_odds = finder.log_odds(rgb_u8, view)
-    known = (tool(index) & view).astype(np.float32)
-    known = cv2.resize(known, log_odds.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
-    return feature_map(log_odds, network_image(rgb_u8, view)), known
-
-
-def _spots(clicks: Sequence[ToolClick], frame: int, known: Mask, view: Mask) -> list[tuple[int, int]]:
-    """(column, row) in the network's image of the clicks of a frame, moved to the nearest pixel that is not masked."""
-    free = small_view(view) & ~known
+def _spot(click: ToolClick, free: Mask, shape: tuple[int, ...]) -> tuple[int, int] | None:
+    """(column, row) of the free pixel (h, w) that is nearest to a click in the image (H, W); None if none is free."""
     rows, columns = np.nonzero(free)
-    spots = []
-    for click in clicks:
-        if click.frame != frame or not len(rows):
-            continue
-        x, y = click.x * known.shape[1] / view.shape[1] - 0.5, click.y * known.shape[0] / view.shape[0] - 0.5
-        nearest = int(((columns - x) ** 2 + (rows - y) ** 2).argmin())
-        spots.append((int(columns[nearest]), int(rows[nearest])))
-    return spots
+    if not len(rows):
+        return None
+    x, y = click.x * free.shape[1] / shape[1] - 0.5, click.y * free.shape[0] / shape[0] - 0.5
+    nearest = int(((columns - x) ** 2 + (rows - y) ** 2).argmin())
+    return int(columns[nearest]), int(rows[nearest])

@@ -1,8 +1,10 @@
 """Examples of tool and tissue from one click, and the classifier that they give.
 
-A click grows to the region around it that is most stable: whose outline changes least when a larger difference from
-the clicked color is allowed (Matas et al., BMVC 2002). Its pixels are examples of the tool. What the masks call tissue
-is tissue, except for what looks like the clicked tool: the same tool is missed in other frames, too.
+What tells a clicked tool from tissue are the network's log-odds, color and local contrast of each pixel. (Features of
+the network's decoder do no better on tools that it misses.) A click grows to the region around it that is most stable:
+whose outline changes least when a larger difference from the clicked color is allowed (Matas et al., BMVC 2002). Its
+pixels are examples of the tool. What the masks call tissue is tissue, except for what looks like the clicked tool: the
+same tool is missed in other frames, too.
 
 `h, w` is the size of the network's image, `k` the number of features, `n` of examples.
 """
@@ -17,75 +19,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import spread
-from .feature_maps import LOOK
-from .logistic import fit_logistic, probability
-from .regions import disk
+from ..footage.components import Mask, components, disk, grown
 
-LARGEST_REGION = 0.08
-"""Largest region of one click, as a share of the view: larger ones have run over tissue."""
-LEAST_REGION_PX = 20
-"""Smaller regions are not compared: their outlines are rough."""
+SURE = 4.0  # Log-odds count up to this, so that examples can outweigh a network that is sure and wrong
+COLORS = 5  # Channels of the network's image: color, two color ratios
+SMOOTH_PX, CONTRAST_PX = 1.0, 2.0  # Standard deviations of the windows of color and contrast
+LEAST_CONTRAST = 0.02  # Added before the logarithm: about the noise of a color of [-1, 1]
+LOOK = slice(0, 1 + COLORS)
+"""The features by which a region of one tool is told from what is beside it: all but the contrast."""
+LARGEST_REGION = 0.08  # Largest region of one click, as a share of the view: larger ones have run over tissue
+LEAST_REGION_PX = 20  # Smaller regions are not compared: their outlines are rough
 FARTHEST, NUM_THRESHOLDS = 2.5, 60
 """Largest difference from the click, in standard deviations of the frame, and number of differences that are tried."""
-STEPS_BESIDE = 3
-"""A region is stable if it grows little from so many thresholds below to so many above."""
-LARGER_IS_BETTER = 0.03
-"""Of two equally stable regions the larger one is taken: weight of the logarithm of the area."""
-GAP_PX = 2
-"""Pixels this near to a tool are not examples of tissue: they are mixed."""
+STEPS_BESIDE = 3  # A region is stable if it grows little from so many thresholds below to so many above
+LARGER_IS_BETTER = 0.03  # Of two equally stable regions the larger one: weight of the logarithm of the area
+GAP_PX = 2  # Pixels this near to a tool are not examples of tissue: they are mixed
 TISSUE, TISSUE_IN_CLICKED, TOOL = 400, 1600, 200
 """Examples of one frame: of tissue, of tissue in the frame of the click, and of tools that are masked already."""
 CLICKED_WEIGHT, CLICKED_MOST, TOOL_WEIGHT = 0.5, 300.0, 0.3
 """Weight of a clicked pixel, of all of them together at most, and of a pixel that is masked already. Tissue weighs 1:
 to take tissue for a tool is worse than to miss a part, which another click finds."""
-LOOKS_CLICKED = 0.7
-"""Tissue of a higher probability is no example: it is likely the clicked tool in another frame."""
+LOOKS_CLICKED = 0.7  # Tissue of a higher probability is no example: it is likely the clicked tool in another frame
 ROUNDS = 2
 RIDGE = 1.0
-Mask = NDArray[np.bool_]
+MOST_STEPS = 20
+SMALLEST_STEP = 1e-3  # A Newton step is halved until the loss falls; below this share of it the fit is done
+SMALL_GAIN = 1e-3  # The fit is done when a step lowers the loss by less
 
 
 @dataclass(frozen=True)
 class Examples:
     """Pixels that are known."""
 
-    features: NDArray[np.float32]
-    """(n, k)."""
-    is_tool: NDArray[np.bool_]
-    """(n,)."""
-    weight: NDArray[np.float64]
-    """(n,)."""
+    features: NDArray[np.float32]  # (n, k)
+    is_tool: Mask  # (n,)
+    weight: NDArray[np.float64]  # (n,)
 
 
 @dataclass(frozen=True)
 class Classifier:
     """Log-odds of a tool from the features of a pixel."""
 
-    mean: NDArray[np.float64]
-    """(k,)."""
-    scale: NDArray[np.float64]
-    """(k,)."""
-    coefficients: NDArray[np.float64]
-    """(k + 1,) of normalized features, and a constant."""
+    mean: NDArray[np.float64]  # (k,)
+    scale: NDArray[np.float64]  # (k,)
+    coefficients: NDArray[np.float64]  # (k + 1,) of normalized features, and a constant
 
     def log_odds(self, features: NDArray[np.float32]) -> NDArray[np.float64]:
         """(...) from features (..., k): those of the network, the first feature, and what the examples add."""
-        return features[..., 0] + self._normal(features) @ self.coefficients[:-1] + self.coefficients[-1]
+        normal = (features - self.mean) / self.scale
+        return features[..., 0] + normal @ self.coefficients[:-1] + self.coefficients[-1]
 
-    def _normal(self, features: NDArray[np.float32]) -> NDArray[np.float64]:
-        return (features - self.mean) / self.scale
+
+def feature_map(log_odds: NDArray[np.float32], image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(h, w, 7) clipped log-odds, smoothed color, log of the local contrast, of log-odds and `network_input`."""
+    gray = image[:3].mean(0)
+    mean, square = (cv2.GaussianBlur(each, (0, 0), CONTRAST_PX) for each in (gray, gray * gray))
+    contrast = np.log(np.sqrt(np.maximum(square - mean * mean, 0)) + np.float32(LEAST_CONTRAST))
+    color = [cv2.GaussianBlur(channel, (0, 0), SMOOTH_PX) for channel in image[:COLORS]]
+    return np.stack([np.clip(log_odds, -SURE, SURE), *color, contrast], -1).astype(np.float32)
 
 
 def clicked_region(features: NDArray[np.float32], free: Mask, spot: tuple[int, int]) -> Mask:
-    """(h, w) the region of one look around a click.
-
-    Args:
-        features: (h, w, k) of `feature_map`.
-        free: (h, w) True where the region can be: in the view, and not on tools that are known.
-        spot: (column, row) of the click, in `free`.
-    Raises:
-        ValueError: the spot is not in `free`.
-    """
+    """(h, w) the region of one look around a click at (column, row), in the view beside known tools: `free`, (h, w)."""
     x, y = spot
     if not free[y, x]:
         raise ValueError(f"spot must be where the region can be; got {spot}")
@@ -98,8 +93,8 @@ def clicked_region(features: NDArray[np.float32], free: Mask, spot: tuple[int, i
     difference = cv2.GaussianBlur(difference.astype(np.float32), (0, 0), 0.8)
     regions: list[Mask] = []
     for most in np.linspace(difference[y, x] + 0.02, FARTHEST, NUM_THRESHOLDS):
-        _, label = cv2.connectedComponents((((difference <= most) & free) | seed).astype(np.uint8), connectivity=4)
-        region = label == label[y, x]
+        labels, _ = components(((difference <= most) & free) | seed, 4)
+        region = labels == labels[y, x]
         if region.sum() > LARGEST_REGION * free.sum():
             break
         regions.append(region)
@@ -107,7 +102,6 @@ def clicked_region(features: NDArray[np.float32], free: Mask, spot: tuple[int, i
 
 
 def _most_stable(areas: NDArray) -> int:
-    """Index of the region that grows least, by the areas of regions of growing thresholds."""
     at = np.arange(len(areas))
     above, below = np.minimum(at + STEPS_BESIDE, len(areas) - 1), np.maximum(at - STEPS_BESIDE, 0)
     log = np.log(areas)
@@ -117,22 +111,17 @@ def _most_stable(areas: NDArray) -> int:
 
 
 def examples_of(features: NDArray[np.float32], view: Mask, tool: Mask, clicked: Mask) -> Examples:
-    """The examples of one frame.
-
-    Args:
-        features: (h, w, k).
-        view: (h, w) True inside the endoscope's image.
-        tool: (h, w) True on tools that are masked already.
-        clicked: (h, w) True on the regions of clicks; all False in most frames.
+    """The examples of one frame: `view` (h, w) is True inside the endoscope's image, `tool` on tools that are masked
+    already, `clicked` on the regions of clicks; all False in most frames.
     """
-    near = cv2.dilate((tool | clicked).astype(np.uint8), disk(GAP_PX)) > 0
+    near = grown(tool | clicked, disk(GAP_PX))
     some_clicked, total = clicked.any(), max(float(clicked.sum()), 1.0)
     parts = (
         (clicked, int(total), True, min(CLICKED_WEIGHT, CLICKED_MOST / total)),
         (tool & ~clicked & view, TOOL, True, TOOL_WEIGHT),
         (view & ~near, TISSUE_IN_CLICKED if some_clicked else TISSUE, False, 1.0),
     )
-    rows = [_evenly(features[where], most) for where, most, _, _ in parts]
+    rows = [features[where][spread(int(where.sum()), most)] for where, most, _, _ in parts]
     counts = [len(row) for row in rows]
     return Examples(
         np.concatenate(rows),
@@ -142,15 +131,12 @@ def examples_of(features: NDArray[np.float32], view: Mask, tool: Mask, clicked: 
 
 
 def fit(frames: Sequence[Examples]) -> Classifier:
-    """Fit a classifier to the examples of some frames.
-
-    Tissue that looks like a tool after the first round is left out of the second.
-    """
+    """Fit a classifier to examples, twice: tissue that looks like a tool after the first round is left out."""
     features = np.concatenate([each.features for each in frames])
     is_tool = np.concatenate([each.is_tool for each in frames])
     weight = np.concatenate([each.weight for each in frames])
     mean, scale = features.mean(0, dtype=np.float64), features.std(0, dtype=np.float64) + 1e-3
-    kept = np.ones(len(features), bool)
+    classifier, kept = Classifier(mean, scale, np.zeros(features.shape[1] + 1)), np.ones(len(features), bool)
     for _ in range(ROUNDS):
         normal = (features[kept] - mean) / scale
         offset = features[kept, 0].astype(np.float64)
@@ -159,6 +145,36 @@ def fit(frames: Sequence[Examples]) -> Classifier:
     return classifier
 
 
-def _evenly(rows: NDArray, most: int) -> NDArray:
-    """At most so many rows, spread evenly."""
-    return rows[spread(len(rows), most)] if len(rows) > most else rows
+def fit_logistic(
+    features: NDArray, is_tool: Mask, weight: NDArray, offset: NDArray, ridge: float
+) -> NDArray[np.float64]:
+    """Logistic regression by damped Newton steps: (k + 1,) coefficients of the features, and a constant, which add to
+    the `offset` (n,), log-odds that are known before. `ridge`, above 0, holds the coefficients of features (n, k) near
+    0.
+    """
+    x = np.hstack([features, np.ones((len(features), 1))]).astype(np.float64)
+    penalty, sign = np.append(np.full(features.shape[1], ridge), 1e-3), np.where(is_tool, 1.0, -1.0)
+    found = np.zeros(x.shape[1])
+
+    def loss(at: NDArray) -> float:
+        return float(weight @ np.logaddexp(0, -sign * (offset + x @ at)) + penalty @ at**2 / 2)
+
+    now = loss(found)
+    for _ in range(MOST_STEPS):
+        p = probability(offset + x @ found)
+        gradient = x.T @ (weight * (p - is_tool)) + penalty * found
+        curvature = (x * (weight * p * (1 - p))[:, None]).T @ x + np.diag(penalty)
+        step, share = np.linalg.solve(curvature, gradient), 1.0
+        while (then := loss(found - share * step)) > now:
+            share /= 2
+            if share < SMALLEST_STEP:
+                return found
+        found, gain, now = found - share * step, now - then, then
+        if gain < SMALL_GAIN:
+            break
+    return found
+
+
+def probability(log_odds: NDArray) -> NDArray:
+    """Of log-odds; without overflow."""
+    return 1 / (1 + np.exp(-np.clip(log_odds, -50, 50)))

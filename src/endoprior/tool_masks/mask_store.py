@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..data.images import read_tool_mask, save_png
+from ..footage.components import Mask
 from ..system.atomic import whole_file, write_json
 
 STATE = "state.json"
 
 
-class MaskStore(Mapping[int, NDArray[np.bool_]]):
+class MaskStore(Mapping[int, Mask]):
     """Masks by frame; `mask` gives an empty one where none was written."""
 
     def __init__(self, folder: Path, size: tuple[int, int]) -> None:
@@ -24,7 +24,7 @@ class MaskStore(Mapping[int, NDArray[np.bool_]]):
         self.folder, self._shape = folder, size[::-1]
         folder.mkdir(parents=True, exist_ok=True)
 
-    def __getitem__(self, index: int) -> NDArray[np.bool_]:
+    def __getitem__(self, index: int) -> Mask:
         file = self._file(index)
         if not file.exists():
             raise KeyError(index)
@@ -34,19 +34,18 @@ class MaskStore(Mapping[int, NDArray[np.bool_]]):
         return iter(sorted(int(file.stem) for file in self.folder.glob("*.png")))
 
     def __len__(self) -> int:
-        return len(list(iter(self)))
+        return sum(1 for _ in self)
 
-    def mask(self, index: int) -> NDArray[np.bool_]:
+    def mask(self, index: int) -> Mask:
         """(H, W) the mask of a frame; empty if none was written."""
-        file = self._file(index)
-        return read_tool_mask(file) if file.exists() else np.zeros(self._shape, bool)
+        return self[index] if self._file(index).exists() else np.zeros(self._shape, bool)
 
-    def put(self, index: int, mask: NDArray[np.bool_]) -> None:
+    def put(self, index: int, mask: Mask) -> None:
         """Write the mask (H, W) of a frame."""
         with whole_file(self._file(index)) as temporary:
             save_png(temporary, np.where(mask, 255, 0).astype(np.uint8))
 
-    def add(self, index: int, mask: NDArray[np.bool_]) -> None:
+    def add(self, index: int, mask: Mask) -> None:
         """Add the pixels of a mask (H, W) to that of a frame. To add them twice changes nothing."""
         if mask.any():
             self.put(index, self.mask(index) | mask)

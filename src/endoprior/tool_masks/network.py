@@ -1,29 +1,38 @@
 """The network that finds tools: a U-Net of a million weights, trained by `tool_training` on composites.
 
 It sees one frame, so it needs neither motion nor a second frame; `h, w` is the size of the image that it gets, whose
-longer side is `LONG_SIDE_PX`.
+longer side is `LONG_SIDE_PX`. Its weights are a file in the package, checked against its digest; docs/tool_network.md
+says how they were made.
 """
 
 from __future__ import annotations
 
+import hashlib
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn import functional
 
-LONG_SIDE_PX = 192
-"""Longer side of the images: a shaft is 15 px wide, a jaw 3."""
-CHANNELS = (16, 32, 64, 112, 144)
-"""Channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the size."""
-INPUTS = 6
-"""Channels of the image: color, two color ratios, the view."""
+from ..core.checks import input_error
+from ..footage.components import Image, Mask
+
+FILE = Path(__file__).with_name("tool_network.safetensors")
+SHA256 = "c49c792f112e198d4a1d206bd207df48166d957f0cd12afebde312d891b96c9c"
+"""Of the file; a test compares it with the file and with the model card."""
+LONG_SIDE_PX = 192  # Longer side of the images: a shaft is 15 px wide, a jaw 3
+CHANNELS = (16, 32, 64, 112, 144)  # Channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the size
+INPUTS = 6  # Channels of the image: color, two color ratios, the view
 DARK = 0.04
 """Added to each channel, in [0, 1], before the logarithm: about the noise of dark pixels, which have no color."""
 MATTE = (0.1, 0.85)
 """A pixel whose largest channel is above the first and whose smallest is below the second shows a surface's color."""
-MULTIPLE = 32
-"""Images are padded to a multiple of this, px."""
+MULTIPLE = 32  # Images are padded to a multiple of this, px
 
 
 class ToolNetwork(nn.Module):
@@ -40,10 +49,8 @@ class ToolNetwork(nn.Module):
         self.out = nn.ModuleList(nn.Conv2d(c, 4 if k == 0 else 1, 3, 1, 1) for k, c in enumerate(CHANNELS))
 
     def levels(self, image: Tensor) -> list[Tensor]:
-        """Log-odds (n, 1, h / 2^k, w / 2^k) from the coarsest level, k = 5, to the finest, k = 0.
-
-        Args:
-            image: (n, 6, h, w) of `network_input`; h, w multiples of `MULTIPLE`.
+        """Log-odds (n, 1, h / 2^k, w / 2^k) from the coarsest level, k = 5, to the finest, k = 0, of (n, 6, h, w)
+        `network_input`; h, w are multiples of `MULTIPLE`.
         """
         x = functional.pixel_unshuffle(image, 2)
         skips = []
@@ -72,7 +79,7 @@ def _layer(inputs: int, outputs: int, stride: int = 1) -> nn.Module:
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
 
 
-def network_input(rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_]) -> NDArray[np.float32]:
+def network_input(rgb_u8: Image, view: Mask) -> NDArray[np.float32]:
     """(6, h, w) of (h, w, 3) `rgb_u8` and (h, w) `view`: color in [-1, 1], two color ratios, the view; 0 beyond it.
 
     The ratios are log(red / green) and log(blue / green), less their median over the frame: what is less red than most
@@ -84,6 +91,45 @@ def network_input(rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_]) -> NDArray
     ratios = logs[..., (0, 2)] - logs[..., 1:2]
     usual = np.median(ratios[matte], 0) if matte.any() else np.zeros(2, np.float32)
     ratios = np.clip(ratios - usual, -2, 2)
-    return (np.concatenate([2 * color - 1, ratios, np.ones_like(color[..., :1])], -1) * view[..., None]).transpose(
-        2, 0, 1
-    )
+    channels = np.concatenate([2 * color - 1, ratios, np.ones_like(color[..., :1])], -1) * view[..., None]
+    return channels.transpose(2, 0, 1)
+
+
+@cache
+def shipped_network() -> ToolNetwork:
+    """The network that comes with the program, for inference only; InputError if the file is missing or changed."""
+    fix = "install the program again."
+    try:
+        data = FILE.read_bytes()
+    except OSError as error:
+        raise input_error(FILE, "the weights of the tool network", f"{error.strerror}", fix) from None
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != SHA256:
+        raise input_error(FILE, f"a file with SHA-256 {SHA256[:12]}...", f"{digest[:12]}...", fix)
+    return network_from(data)
+
+
+def network_from_file(path: Path) -> ToolNetwork:
+    """A network for inference from a weights file that a user names; InputError if it is none."""
+    fix = "Name a file that `endoprior bench masks --write-weights` wrote."
+    try:
+        return network_from(path.read_bytes())
+    except OSError as error:
+        raise input_error(path, "a weights file", f"{error.strerror}", fix) from None
+    except (SafetensorError, RuntimeError, AttributeError) as error:
+        raise input_error(path, "the weights of a tool network", f"{str(error).splitlines()[0]:.80}", fix) from None
+
+
+def network_from(data: bytes) -> ToolNetwork:
+    """A network for inference from the bytes of a weights file."""
+    network = ToolNetwork()
+    counters = {name: value for name, value in network.state_dict().items() if not value.is_floating_point()}
+    network.load_state_dict(counters | {name: value.float() for name, value in load(data).items()})
+    network.eval().requires_grad_(False)
+    return network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]: missing in the stubs
+
+
+def weights_of(network: ToolNetwork) -> bytes:
+    """The bytes of a weights file: every weight in float16, without counters."""
+    state = network.state_dict()
+    return save({name: value.half().contiguous() for name, value in state.items() if value.is_floating_point()})

@@ -1,8 +1,7 @@
-"""Adaptive density control guided by the prior: running statistics, what to clone, split and remove, and doing it.
+"""Adaptive density control guided by the prior: what to clone, split and remove, and doing it.
 
-Eqs. (7) and (8) and the pruning rule after them. `plan` only decides; `apply_plan` acts, the one place that resizes
-per-Gaussian tensors. Statistics are gathered in PyTorch here, on any device, and by `density_numba.py`. `skip` is a ()
-float32 tensor on the device, or None: where it is not 0, nothing is added (`divergence.py`). `N` Gaussians.
+Eq. (8) and the pruning rule after it. `plan` only decides, by what `density_stats.py` gathered; `apply_plan` acts, the
+one place that resizes per-Gaussian tensors. `N` Gaussians.
 """
 
 from __future__ import annotations
@@ -15,79 +14,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from ..compute.morton import morton_order
 from ..core.config import DensityConfig, ReleasedMethod
 from ..core.geometry import quaternion_to_matrix
-from ..core.types import RenderOutput
 from ..model.gaussians import SH_C0, Gaussians
+from .density_stats import DensityStats
 from .divergence import ADVICE, Diverged
 
 if TYPE_CHECKING:
     from .optimizer import Optimizer
 
-SCORE_EPS = 1e-6
-"""epsilon of Eq. (7)."""
-MAX_GAUSSIANS = 200_000
-"""Growth stops at this count: a guard of memory, not part of the method."""
-CLONE_EXTENT = 0.01
-"""Gaussians with a scale up to this share of the scene extent are cloned, larger ones split."""
-SPLIT_SHRINK = 1.6
-"""Children of a split have the parent's scale divided by this."""
-PRIOR_OPACITY = 0.0075
-"""tau_alpha: Gaussians of low prior are removed below this mean opacity."""
-
-
-@dataclass
-class DensityStats:
-    """Sums per Gaussian since the last event (gradient) or since the stage began (score)."""
-
-    grad2d_ndc_sum: Tensor
-    """(N,) sum of screen-space gradient norms, NDC units."""
-    num_seen: Tensor
-    """(N,) times rendered since the last event."""
-    score_sum: Tensor
-    """(N,) sum of rho at the projected center over valid projections."""
-    num_valid: Tensor
-    """(N,) n_i: valid projections at which the score was sampled."""
-    opacity_sum: Tensor
-    """(N,) sum of the opacity at those projections."""
-
-    @staticmethod
-    def zeros(num: int, device: torch.device | str = "cpu") -> DensityStats:
-        """Statistics of `num` Gaussians of which nothing is known."""
-        return DensityStats(*(torch.zeros(num, device=device) for _ in range(5)))
-
-    def tensors(self) -> dict[str, Tensor]:
-        """The sums by name."""
-        return dict(vars(self))
-
-    def score(self, unobserved: float) -> Tensor:
-        """(N,) texture-prior score s in [0, 1], Eq. (7); `unobserved` where nothing was sampled."""
-        mean = self.score_sum / (self.num_valid + SCORE_EPS)
-        return torch.where(self.num_valid > 0, mean, unobserved)
-
-    def mean_opacity(self, current: Tensor) -> Tensor:
-        """(N,) running mean opacity; the `current` one where nothing was sampled."""
-        return torch.where(self.num_valid > 0, self.opacity_sum / self.num_valid.clamp(min=1), current)
-
-    def clear_gradient(self) -> None:
-        """Forget the gradients of every Gaussian, as each density event does."""
-        self.grad2d_ndc_sum.zero_()
-        self.num_seen.zero_()
+MAX_GAUSSIANS = 200_000  # growth stops at this count: a guard of memory, not part of the method
+CLONE_EXTENT = 0.01  # Gaussians with a scale up to this share of the scene extent are cloned, larger ones split
+SPLIT_SHRINK = 1.6  # children of a split have the parent's scale divided by this
+PRIOR_OPACITY = 0.0075  # tau_alpha: Gaussians of low prior are removed below this mean opacity
 
 
 @dataclass(frozen=True)
 class Plan:
     """What one density event does to each of `N` Gaussians; at most one of the three is True."""
 
-    clone: Tensor
-    """(N,) bool: a copy is added."""
-    split: Tensor
-    """(N,) bool: replaced by two smaller children."""
-    remove: Tensor
-    """(N,) bool: goes."""
+    clone: Tensor  # (N,) bool: a copy is added
+    split: Tensor  # (N,) bool: replaced by two smaller children
+    remove: Tensor  # (N,) bool: goes
     removed_by: Mapping[str, Tensor] = field(default_factory=dict)
     """(N,) bool by rule that can take Gaussians: those that it condemns, whatever becomes of them."""
 
@@ -125,32 +75,22 @@ def plan(
         clone_extent: share of the extent up to which a Gaussian is cloned, not split.
     """
     released = released or ReleasedMethod()
-    largest_mm, by_prior = released.prune_max_scale_mm, cfg.min_densify_weight < 1
-    score = stats.score(released.unobserved_score)
+    largest_mm, by_prior = released.prune_max_scale_mm or math.inf, cfg.min_densify_weight < 1
+    score, largest = stats.score(released.unobserved_score), scales.amax(-1)
     gradient = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1)
-    largest = scales.amax(-1)
-    faint = opacities < cfg.prune_opacity
-    huge = largest > largest_mm if largest_mm > 0 else torch.zeros_like(faint)
-    distrusted = torch.zeros_like(faint)
-    if by_prior:
-        distrusted = (
-            (stats.num_valid >= cfg.min_valid)
-            & (score < cfg.prior_threshold)
-            & (stats.mean_opacity(opacities) < PRIOR_OPACITY)
-        )
+    faint, huge = opacities < cfg.prune_opacity, largest > largest_mm
+    unlikely = (score < cfg.prior_threshold) & (stats.mean_opacity(opacities) < PRIOR_OPACITY)
+    distrusted = (stats.num_valid >= cfg.min_valid) & unlikely if by_prior else torch.zeros_like(faint)
+    condemned = faint | huge | distrusted
     grow = (densify_weight(score, cfg) * gradient >= cfg.grow_threshold) & ~faint
     small = largest <= clone_extent * extent
     # Pruning follows growth: children are smaller and unobserved, so only their size can condemn them.
-    children_huge = huge & (largest / SPLIT_SHRINK > largest_mm)
-    split = grow & ~small & ~children_huge
-    clone = grow & small & ~huge & ~distrusted
-    remove = (faint | huge | distrusted) & ~split
+    split = grow & ~small & (largest / SPLIT_SHRINK <= largest_mm)
+    clone, remove = grow & small & ~condemned, condemned & ~split
     if len(scales) + int(clone.sum()) + int(split.sum()) - int(remove.sum()) > MAX_GAUSSIANS:
-        clone, split = torch.zeros_like(clone), torch.zeros_like(split)
-        remove = faint | huge | distrusted
-    rules = {"opacity": faint} | ({"size": huge} if largest_mm else {})
-    rules |= {"prior": distrusted} if by_prior else {}
-    return Plan(clone=clone, split=split, remove=remove, removed_by=rules)
+        clone, split, remove = torch.zeros_like(clone), torch.zeros_like(split), condemned
+    rules = {"opacity": faint} | ({"size": huge} if released.prune_max_scale_mm else {})
+    return Plan(clone, split, remove, rules | ({"prior": distrusted} if by_prior else {}))
 
 
 def scene_extent(camera_centers: Tensor) -> float:
@@ -159,65 +99,6 @@ def scene_extent(camera_centers: Tensor) -> float:
     As 3DGS has it: 0 for a still camera, so that nothing is cloned.
     """
     return 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
-
-
-def add_gradient(stats: DensityStats, out: RenderOutput, width: int, height: int, skip: Tensor | None = None) -> None:
-    """Add the screen-space gradient of one image, after backward; Gaussians that were not rendered keep their sums.
-
-    Args:
-        width, height: of the image, px.
-    """
-    counted = _counted(out.radii > 0, skip)
-    x, y = out.means2d.grad.unbind(-1)
-    stats.grad2d_ndc_sum += torch.where(counted, torch.hypot(x * (width / 2), y * (height / 2)), 0)
-    stats.num_seen += counted
-
-
-def add_score(
-    stats: DensityStats,
-    out: RenderOutput,
-    prior: Tensor,
-    tissue_mask: Tensor,
-    opacities: Tensor,
-    scale: float = 1.0,
-    skip: Tensor | None = None,
-) -> None:
-    """Sample rho where the rendered centers fall on tissue: s_it and m_it of Eq. (7).
-
-    Args:
-        prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) bool, True on tissue. opacities: (N,) canonical.
-        scale: pixels of `prior` per pixel of the image.
-    """
-    at = scale * out.means2d.detach()
-    counted = _counted(valid_projection(at, out.radii, tissue_mask), skip)
-    stats.score_sum += torch.where(counted, _sample(prior, at), 0)
-    stats.opacity_sum += torch.where(counted, opacities.detach(), 0)
-    stats.num_valid += counted
-
-
-def valid_projection(means2d: Tensor, radii: Tensor, tissue_mask: Tensor) -> Tensor:
-    """(N,) bool m_it of Eq. (7): rendered, inside the image, and on tissue (interpolated mask above one half).
-
-    Args:
-        means2d: (N, 2) px. radii: (N,) px, 0 where not rendered. tissue_mask: (H, W) bool, True on tissue.
-    """
-    height, width = tissue_mask.shape
-    x, y = means2d.detach().unbind(-1)
-    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
-    return (radii > 0) & inside & (_sample(tissue_mask.float(), means2d.detach()) > 0.5)
-
-
-def _counted(rendered: Tensor, skip: Tensor | None) -> Tensor:
-    return rendered if skip is None else rendered & (skip == 0)
-
-
-def _sample(image: Tensor, means2d: Tensor) -> Tensor:
-    """(N,) bilinear values of an (H, W) image at (N, 2) px; centers at half integers, border repeated, NaN for NaN."""
-    height, width = image.shape
-    x, y = means2d.unbind(-1)
-    where = torch.stack([2 * x / width - 1, 2 * y / height - 1], -1)
-    found = grid_sample(image[None, None], where[None, None], padding_mode="border", align_corners=False)
-    return found[0, 0, 0]
 
 
 def apply_plan(
@@ -247,7 +128,8 @@ def apply_plan(
         state = optimizer.states[name]
         state.first, state.second = (_with_zeros(m, rows) for m in (state.first, state.second))
     grown = DensityStats(*(_with_zeros(value, rows) for value in stats.tensors().values()))
-    grown.clear_gradient()
+    for cleared in (grown.grad2d_ndc_sum, grown.num_seen):
+        cleared.zero_()
     cloned, halved = (part.nonzero()[:, 0] for part in (plan.clone, plan.split))
     parents = torch.cat([torch.arange(len(plan.split), device=rows.device), cloned, halved, halved])
     return grown, parents[rows]

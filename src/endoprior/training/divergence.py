@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,18 +23,13 @@ from torch import Tensor
 
 from ..core.checks import InputError
 
-LARGEST_GRADIENT = 1e15
-"""Beyond this, or without a value, a gradient means that the run has diverged."""
-CHECK_EVERY = 20
-"""Iterations between two checks on a device: each check makes the host wait once."""
-WINDOW = 300
-"""Iterations over which images that are no better than empty ones count as divergence."""
+LARGEST_GRADIENT = 1e15  # beyond this, or without a value, a gradient means that the run has diverged
+CHECK_EVERY = 20  # iterations between two checks on a device: each check makes the host wait once
+WINDOW = 300  # iterations over which images that are no better than empty ones count as divergence
 PARTS = 10
 """... in each of so many parts of them: a bad start, such as gray for dark frames, must not outweigh what follows."""
-NO_BETTER = 0.95
-"""... when their color error is this share of that of the background alone."""
-ALIKE = 0.02
-"""Error of the background alone below which that is a fair guess and nothing is concluded."""
+NO_BETTER = 0.95  # ... when their color error is this share of that of the background alone.
+ALIKE = 0.02  # error of the background alone below which that is a fair guess and nothing is concluded
 
 ADVICE = "Lower the learning rates (--optim...), or look for wrong depth and poses with `endoprior check`"
 """For a method of Gaussians."""
@@ -43,31 +38,20 @@ ADVICE = "Lower the learning rates (--optim...), or look for wrong depth and pos
 class Diverged(InputError):
     """Training cannot continue; the state before the iteration it is about is unchanged."""
 
-
-@dataclass(frozen=True)
-class Divergence:
-    """Why a run has diverged."""
-
-    reason: str
-    last_good: int
-    """Iteration of the stage after which the state was left unchanged."""
+    def __init__(self, reason: str, last_good: int = 0) -> None:
+        """Args: last_good: the iteration of the stage whose state was kept, where a check tells."""
+        super().__init__(reason)
+        self.last_good = last_good
 
 
 def unusable_numbers(terms: Mapping[str, float], unusable: Mapping[str, int], advice: str = ADVICE) -> str | None:
-    """What is wrong with the numbers of an iteration, if anything is.
-
-    Args:
-        terms: weighted terms of the loss.
-        unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
-        advice: what to do.
-    """
+    """What is wrong with the terms of the loss, or with gradients of so many `unusable` entries; ends with `advice`."""
     found = [f"{name} {value}" for name, value in terms.items() if not math.isfinite(value)]
     found += [f"{count:,} unusable entries in the gradient of {name}" for name, count in unusable.items() if count]
     return f"expected a finite loss and gradient; got {', '.join(found)}. {advice}" if found else None
 
 
-@dataclass(frozen=True)
-class _Numbers:
+class _Numbers(NamedTuple):
     """What an iteration is checked by; `values` may lie on a device."""
 
     iteration: int
@@ -97,7 +81,7 @@ class DivergenceCheck:
         empty_error: float,
         *,
         wait: bool,
-    ) -> Divergence | None:
+    ) -> None:
         """Take in an iteration before its update; on a device the answer may come some iterations later.
 
         Args:
@@ -105,6 +89,8 @@ class DivergenceCheck:
             unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
             color_error: (); empty_error: see `Watch.see`.
             wait: read the results now: what follows cannot be undone.
+        Raises:
+            Diverged: as `read`.
         """
         counts = [torch.as_tensor(count, dtype=torch.float64) for count in unusable.values()]
         values = torch.stack([*(value.detach().double() for value in (*terms.values(), color_error)), *counts])
@@ -112,15 +98,14 @@ class DivergenceCheck:
         if self.skip is not None:
             usable = values.isfinite().all() & (values[len(terms) + 1 :] == 0).all()
             self.skip.copy_(torch.maximum(self.skip, (~usable).float()))
-            if not wait and len(self._pending) < CHECK_EVERY:
-                return None
-        return self.results(applied=iteration - 1)
+        if self.skip is None or wait or len(self._pending) >= CHECK_EVERY:
+            self.read(applied=iteration - 1)
 
-    def results(self, applied: int) -> Divergence | None:
-        """Check what is pending; on a device the host waits for it.
+    def read(self, applied: int) -> None:
+        """Check what is pending; iteration `applied` was the last to be updated or skipped. A device is waited for.
 
-        Args:
-            applied: last iteration whose update was made or skipped.
+        Raises:
+            Diverged: one of them was unusable, or images show nothing.
         """
         pending, self._pending = self._pending, []
         values = iter(torch.cat([each.values for each in pending]).tolist() if pending else [])
@@ -133,8 +118,7 @@ class DivergenceCheck:
             if reason is not None:
                 if self.skip is not None:
                     self.skip.zero_()  # who continues does so from the last good state
-                return Divergence(reason, last_good)
-        return None
+                raise Diverged(reason, last_good)
 
 
 class Watch:
@@ -145,14 +129,11 @@ class Watch:
         self._errors: deque[tuple[float, float]] = deque(maxlen=WINDOW)
 
     def see(self, color_error: float, empty_error: float) -> str | None:
-        """Take in one iteration.
+        """What is wrong after one more iteration: over `WINDOW` of them no image was better than an empty one.
 
         Args:
             color_error: error of the image over tissue: mean absolute, or what else colors of 0 to 1 are compared by.
             empty_error: that of an image that shows only the background.
-        Returns:
-            What is wrong, if over the last `WINDOW` iterations the images were no better than empty ones, in each of
-            their `PARTS`.
         """
         self._errors.append((color_error, empty_error))
         if len(self._errors) < WINDOW:

@@ -24,23 +24,16 @@ class TrainingFrame:
     """One training frame at one resolution."""
 
     index: int
-    time: float
-    """In [0, 1)."""
+    time: float  # in [0, 1)
     camera: Camera
-    rgb_u8: Tensor
-    """(H, W, 3) uint8."""
-    tissue_mask: Tensor
-    """(H, W) bool, True on tissue."""
+    rgb_u8: Tensor  # (H, W, 3) uint8
+    tissue_mask: Tensor  # (H, W) bool, True on tissue
     hidden: Tensor
     """(H, W) bool, True where something hides tissue: within the convex hull of `tissue_mask`, and not on it."""
-    inverse_depth: Tensor
-    """(H, W) 1 / mm; 0 where there is no depth."""
-    measured: Tensor
-    """(H, W) bool, True where tissue has a depth."""
-    num_measured: int
-    """Pixels of `measured`."""
-    brightness: float
-    """Mean color over tissue, in [0, 1]; 0 without tissue."""
+    inverse_depth: Tensor  # (H, W) 1 / mm; 0 where there is no depth
+    measured: Tensor  # (H, W) bool, True where tissue has a depth
+    num_measured: int  # pixels of `measured`
+    brightness: float  # mean color over tissue, in [0, 1]; 0 without tissue
 
     @property
     def rgb(self) -> Tensor:
@@ -53,23 +46,22 @@ class TrainingFrame:
         return torch.where(self.inverse_depth > 0, 1 / self.inverse_depth.clamp(min=1e-12), 0)
 
 
-DEVICE_SHARE = 0.25
-"""Share of a device's free memory that frames may take; frames beyond it are copied at each use."""
+DEVICE_SHARE = 0.25  # share of a device's free memory that frames may take; frames beyond it are copied at each use
 
 
 class TrainingFrames:
     """Training frames of a sequence by position, built when first used, cached in memory and on the device."""
 
     def __init__(self, sequence: FrameSequence, border: Border = "reflect", device: torch.device | str = "cpu") -> None:
-        """Args: sequence: source of the frames. border: of the prior. device: where tensors are returned."""
+        """Args: border: of the prior. device: where tensors are returned."""
         self.sequence, self.device = sequence, torch.device(device)
         self.indices = sequence.indices("train")
         self._border: Border = border
-        self._frames: BoundedCache[TrainingFrame] = BoundedCache(cache_bytes(), _frame_bytes)
-        self._priors: BoundedCache[Tensor] = BoundedCache(cache_bytes() // 4, lambda prior: prior.nbytes)
-        device_limit = device_bytes(self.device)
-        self._device_frames: BoundedCache[TrainingFrame] = BoundedCache(device_limit, _frame_bytes)
-        self._device_priors: BoundedCache[Tensor] = BoundedCache(device_limit // 4, lambda prior: prior.nbytes)
+        limits = cache_bytes(), device_bytes(self.device)
+        self._frames, self._device_frames = (BoundedCache[TrainingFrame](limit, _frame_bytes) for limit in limits)
+        self._priors, self._device_priors = (
+            BoundedCache[Tensor](limit // 4, lambda prior: prior.nbytes) for limit in limits
+        )
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -21,29 +21,28 @@ from ..model.scene_facts import SceneFacts
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec
 from . import density
-from .density import DensityStats, Plan
+from .density import Plan
+from .density_stats import DensityStats
 from .frames import TrainingFrames
 from .gaussian_trainer import GaussianTrainer
 from .losses import supervised_terms
 from .ops import TrainingOps
 from .optimizer import Rate, rate_of
-from .stage import Stage
 from .step import Drawn
-from .trainer import Trainer
+from .trainer import Stage, Trainer
 
-EPOCHS = 2**31
-"""Keeps the random numbers of epochs apart from those of iterations."""
+EPOCHS = 2**31  # keeps the random numbers of epochs apart from those of iterations
 
 
 class GaussianMethod(Method):
-    """See `Method`. A subclass gives its `motion`, and overrides what it does differently."""
+    """See `Method`. A subclass gives its `motion`, and overrides what it does differently.
 
-    uses_prior = True
-    """The texture prior of the frames is computed, for density control and the temporal term."""
-    keeps_optimizer = False
-    """Adam's moments and steps go on from the coarse to the fine stage."""
-    starts_from_flow = False
-    """Its Gaussians can start with the motion that optical flow finds: `init.motion flow`."""
+    Arguments with an underscore are for methods that decide by more than our own does.
+    """
+
+    uses_prior = True  # the texture prior of the frames is computed, for density control and the temporal term
+    keeps_optimizer = False  # adam's moments and steps go on from the coarse to the fine stage
+    starts_from_flow = False  # its Gaussians can start with the motion that optical flow finds: `init.motion flow`.
     color_is_error = False
     """Its term `color` is the mean absolute error over tissue; else the divergence check has that computed."""
     first_share = 0.0
@@ -67,24 +66,19 @@ class GaussianMethod(Method):
         return SingleScene.of_arrays(arrays, cameras, facts, self.motion(facts.config))
 
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
-        """The Gaussians before training, from the training frames.
-
-        Raises:
-            InputError: the frames give too few points.
-        """
+        """The Gaussians before training; InputError if the training frames give too few points."""
         return first_gaussians(frames, cfg)
 
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
         """Learning rate of a tensor of the Gaussians, of a parameter of the field or of its planes."""
         return rate_of(name, cfg, spatial_scale)
 
-    def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
+    def position(self, _seed: int, stage: Stage, _iteration: int, num_frames: int, rng: np.random.Generator) -> int:
         """The training frame of an iteration; a pure function of its arguments. `rng` belongs to the iteration."""
         return int(rng.integers(num_frames)) if stage is Stage.FINE else 0
 
     def context(self, frames: TrainingFrames, cfg: Config) -> Any:
         """What the loss needs of all training frames, made once: `Drawn.context`."""
-        return None
 
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         """The weighted terms of the loss, () each."""
@@ -95,27 +89,20 @@ class GaussianMethod(Method):
         return density.due(iteration, stage is Stage.FINE and last, cfg.density)
 
     def plan(
-        self,
-        stats: DensityStats,
-        gaussians: Gaussians,
-        extent: float,
-        stage: Stage,
-        iteration: int,
-        cfg: Config,
+        self, stats: DensityStats, gaussians: Gaussians, extent: float, _stage: Stage, _iteration: int, cfg: Config
     ) -> Plan:
         """What to clone, split and remove; see `density.plan`."""
         scales, opacities = gaussians.scales, gaussians.opacities
         return density.plan(stats, scales, opacities, extent, cfg.density, cfg.released, self.clone_extent)
 
-    def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
+    def reset_due(self, _stage: Stage, _iteration: int, _cfg: Config) -> bool:
         """Whether opacities are lowered to 0.01 after this iteration."""
         return False
 
     def empty_error(self, brightness: float) -> float:
-        """Mean absolute color error, over tissue, of an image of the background alone; at most that, if it is no gray.
+        """Mean absolute color error of an image of the background alone, over tissue of that mean color in [0, 1].
 
-        Args:
-            brightness: mean color of the frame over tissue, in [0, 1].
+        At most that, where the background is no gray.
         """
         return abs(sum(self.background) / 3 - brightness)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -27,19 +27,21 @@ from ..model.motion import Field, Motion
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
-from .density import DensityStats
+from .density import scene_extent
+from .density_stats import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
+from .losses import StartTracks
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
-from .stage import Stage, StepReport, stage_length
 from .step import TrainingStep
-from .track_loss import StartTracks
-from .trainer import DEFAULT_FRAMES_PER_SECOND, Trainer, device_for
+from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
+
+STILL_CAMERA_SCALE = 10.0  # spatial scale of a sequence with a static camera
 
 
 @dataclass
@@ -47,37 +49,29 @@ class GaussiansState:
     """All that changes while training; a checkpoint holds exactly this."""
 
     stage: Stage
-    iteration: int
-    """Iterations of this stage already done."""
+    iteration: int  # iterations of this stage already done
     gaussians: Gaussians
     field: Field | None
     optimizer: Optimizer
     stats: DensityStats
-    tracks: StartTracks | None = None
-    """Where motion started from optical flow and is held to it."""
-    left_out: Tensor | None = None
-    """(F, VISITS) share of the view that was left out as a missed tool in the last visits of each training frame."""
+    tracks: StartTracks | None  # where motion started from optical flow and is held to it
+    left_out: Tensor | None  # (F, VISITS) share of the view that showed a missed tool in the last visits of each frame
 
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
-        arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
-        arrays |= {f"stats.{name}": value for name, value in self.stats.tensors().items()}
-        arrays |= {f"optimizer.{name}": value for name, value in self.optimizer.state_arrays().items()}
-        if self.tracks is not None:
-            arrays |= {f"tracks.{name}": value for name, value in self.tracks.tensors().items()}
-        if self.left_out is not None:
-            arrays["left_out"] = self.left_out
-        if self.field is not None:
-            arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
-        return arrays
+        parts = {
+            "gaussians": {name: value.detach() for name, value in self.gaussians.tensors.items()},
+            "stats": self.stats.tensors(),
+            "optimizer": self.optimizer.state_arrays(),
+            "tracks": self.tracks.tensors() if self.tracks else {},
+            "field": self.field.state_arrays() if self.field else {},
+        }
+        arrays = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
+        return arrays if self.left_out is None else arrays | {"left_out": self.left_out}
 
 
 def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, ArraySpec]:
-    """The arrays of a `GaussiansState`: the model, Adam's moments, statistics of density control, and tracks, if any.
-
-    Args:
-        doubts: also how much of each frame was left out as a missed tool.
-    """
+    """The arrays of a `GaussiansState`; where masks are in doubt, also how much of each frame was left out."""
     model = motion.schema(cfg)
     trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
     trained |= {name: ArraySpec("float32", shape) for name, shape in motion.parameter_shapes(cfg).items()}
@@ -106,19 +100,16 @@ class GaussianTrainer(Trainer):
     state: GaussiansState
 
     def __init__(self, sequence: FrameSequence, cfg: Config, ops: TrainingOps | None = None) -> None:
-        """Prepare; nothing is computed yet.
+        """Prepare with `ops`, or with those that suit the device; nothing is computed yet.
 
-        Args:
-            ops: implementation of the operations; None takes the one that suits the device.
         Raises:
-            InputError: the cameras cannot be used, the backend has no device here, or there is no right eye to train
-                on.
+            InputError: the cameras cannot be used, the backend has no device here, or there is no right eye.
         """
         if cfg.data.eyes == "both" and sequence.right_eye is None:
             fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."
             raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
         self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
-        self.method: GaussianMethod = method_of(cfg)
+        self.method = cast("GaussianMethod", method_of(cfg))
         self.motion = self.method.motion(self.cfg)
         self.device = device_for(cfg.render.backend)
         self.ops = ops or ops_for(self.device)
@@ -129,18 +120,19 @@ class GaussianTrainer(Trainer):
             raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
         frames = TrainingFrames(sequence, "zero" if cfg.released.prior else "reflect", self.device)
         centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
-        self.spatial_scale = spatial_scale(centers, cfg)
+        extent = scene_extent(centers)
+        self.spatial_scale = extent if extent > 1e-3 else STILL_CAMERA_SCALE  # of learning rates that are lengths
         self.step_once = TrainingStep(
-            self.method,
-            self.motion,
-            self.cfg,
-            frames,
-            centers,
-            render.load(cfg.render.backend),
-            self.ops,
-            DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
-            MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
-            torch.tensor(self.method.background, device=self.device),
+            method=self.method,
+            motion=self.motion,
+            cfg=self.cfg,
+            frames=frames,
+            extent=extent,
+            rasterize=render.load(cfg.render.backend),
+            ops=self.ops,
+            check=DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
+            doubt=MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
+            background=torch.tensor(self.method.background, device=self.device),
         )
 
     def start(self) -> None:
@@ -153,7 +145,8 @@ class GaussianTrainer(Trainer):
             coefficients = torch.from_numpy(motion.coefficients)
             gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
             if cfg.loss.track_weight:
-                tracks = StartTracks.of_first(coefficients, torch.from_numpy(motion.followed).float()).to(self.device)
+                followed = torch.from_numpy(motion.followed).float()
+                tracks = StartTracks(coefficients, followed, torch.arange(len(coefficients))).to(self.device)
         field = self.motion.field(gaussians["means"].detach(), cfg)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
         shares = torch.zeros(len(self.sequence.indices("train")), VISITS) if self.step_once.doubt else None
@@ -172,12 +165,7 @@ class GaussianTrainer(Trainer):
         self.state.stats = DensityStats(**stats)
 
     def _enter(
-        self,
-        stage: Stage,
-        gaussians: Gaussians,
-        field: Field | None,
-        tracks: StartTracks | None,
-        shares: Tensor | None,
+        self, stage: Stage, gaussians: Gaussians, field: Field | None, tracks: StartTracks | None, shares: Tensor | None
     ) -> None:
         rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
         optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
@@ -189,27 +177,21 @@ class GaussianTrainer(Trainer):
         return state_schema(self.motion, self.cfg, doubts=self.step_once.doubt is not None)
 
     def step(self) -> StepReport:
-        """See `Trainer.step`, and `TrainingStep` for what happens in it.
-
-        Raises:
-            Diverged: the loss or a gradient is not finite, the images show nothing, or no Gaussian is left.
-        """
+        """See `Trainer.step`, and `TrainingStep` for what happens in it."""
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
             self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.left_out)
             if self.method.keeps_optimizer:
                 self.state.optimizer = state.optimizer
-        report = self.step_once(self.state)
-        if report.divergence is not None:
-            raise Diverged(report.divergence.reason)
-        return report
+        return self.step_once(self.state)
 
     def synchronize(self) -> None:
         """See `Trainer.synchronize`."""
-        divergence = self.step_once.check.results(applied=self.state.iteration)
-        if divergence is not None:
-            self.state.iteration = divergence.last_good
-            raise Diverged(divergence.reason)
+        try:
+            self.step_once.check.read(applied=self.state.iteration)
+        except Diverged as error:
+            self.state.iteration = error.last_good
+            raise
 
     def scene(self) -> SingleScene:
         """See `Trainer.scene`."""
@@ -227,13 +209,3 @@ class GaussianTrainer(Trainer):
             trained_from=trained[0] / num if holds else 0.0,
             trained_until=trained[-1] / num if holds else 1.0,
         )
-
-
-STILL_CAMERA_SCALE = 10.0
-"""Spatial scale of a sequence with a static camera."""
-
-
-def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:
-    """Factor of the learning rates that are lengths: 1.1 x radius of the camera path; constant for a static one."""
-    radius = 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
-    return radius if radius > 1e-3 else STILL_CAMERA_SCALE

@@ -1,11 +1,10 @@
 """Tool pixels that a mask misses, found while training: a tool is what the scene cannot explain.
 
-Masks that a program found miss jaws, blurred ends, and tools that are there for a moment. Trained as tissue, they
-become a ghost. The scene is shared by all frames, so a few frames of a tool do not change it much at first: the error
-of the rendered image shows the tool. Where the error stays far above that of the frame, in a region that continues a
-masked tool or enters from the border as tools do, and of which the tool network is not sure of tissue, pixels do not
-count in this iteration. The decision is made anew each time a frame is rendered: no state, and what the scene learns to
-explain counts again. How much of each frame was left out in its last visits says which masks are likely wrong.
+Masks that a program found miss jaws, blurred ends, and tools that are there for a moment; trained as tissue, they
+become a ghost. A few frames of a tool do not change the shared scene much at first, so the error of the rendered image
+shows the tool. Where the error is far above that of the frame, in a region that continues a masked tool or enters from
+the border as tools do, and the tool network is not sure of tissue, pixels do not count. That is decided anew each time
+a frame is rendered. How much of each frame was left out in its last visits says which masks are likely wrong.
 
 `H, W` image size, `h, w` size of the resized image, 160 px on its longer side, `F` training frames.
 """
@@ -29,23 +28,21 @@ from ..tool_masks.regions import disk, entering_regions, filled
 from ..tool_masks.sequence import view_of
 from .frames import TrainingFrame
 
-WORK_PX = 160
-"""Longer side of the resized image, px: a shaft is about 12 px wide, a jaw 3."""
-START = 0.1
-"""Share of the fine stage after which the scene explains resting tissue."""
-SMOOTH_PX = 3.0
-"""Standard deviation of the window over which the error is averaged, px."""
+WORK_PX = 160  # longer side of the resized image, px: a shaft is about 12 px wide, a jaw 3
+START = 0.1  # share of the fine stage after which the scene explains resting tissue
+SMOOTH_PX = 3.0  # standard deviation of the window over which the error is averaged, px
 SURE, POSSIBLE = (3.0, 0.02), (1.5, 0.01)
 """Errors of a missed tool, as a multiple of the frame's median error plus a constant (colors are 0..1): a pixel on its
 own, and a pixel near such pixels (hysteresis)."""
-NEAR_PX = 8
-"""A possible pixel counts within this distance of a sure one."""
-GAP_PX = 6
-"""Gaps up to twice this width are closed: the middle of a shaft is often explained by its own color."""
+NEAR_PX = 8  # a possible pixel counts within this distance of a sure one
+GAP_PX = 6  # gaps up to twice this width are closed: the middle of a shaft is often explained by its own color
 HIGHLIGHT = (0.5, 0.7)
 """Smallest color channel from which, and up to which, an error counts less: highlights move on tissue too."""
-SURELY_TISSUE = -3.0
-"""Log-odds of a tool below which a pixel always counts."""
+SURELY_TISSUE = -3.0  # log-odds of a tool below which a pixel always counts
+SAMPLES = 12  # frames from which the border of the view is taken
+VISITS = 4  # number of visits that are kept of each frame: early ones show what the scene had not learned yet
+LEAST_SHARE = 0.005  # share of the view above which a visit speaks for a missed tool: about 40 px square at 640x512
+LEAST_VISITS = 2  # so many of the last visits must; a single one may be a highlight
 
 
 def missed_tools(
@@ -59,9 +56,7 @@ def missed_tools(
 
     Args:
         rendered, rgb: (h, w, 3) color in [0, 1].
-        tissue_mask: (h, w) True on tissue, as the mask has it.
-        view: (h, w) True inside the endoscope's image.
-        surely_tissue: (h, w) True where the tool network is sure of tissue.
+        view: (h, w) True inside the endoscope's image. surely_tissue: (h, w) True where the tool network is sure.
     """
     if not tissue_mask.any():
         return np.zeros_like(tissue_mask)
@@ -85,28 +80,23 @@ def missed_tools(
     return (cv2.dilate(entering.astype(np.uint8), disk(1)) > 0) & tissue_mask
 
 
-SAMPLES = 12
-"""Frames from which the border of the view is taken."""
-
-
 class MaskDoubt:
     """Takes pixels that show a tool in spite of the mask out of a training frame."""
 
     def __init__(self, sequence: FrameSequence) -> None:
-        """Find the border of the view in the training frames of `sequence`."""
         indices = sequence.indices("train")
         frames = [sequence.frame(indices[k]) for k in spread(len(indices), SAMPLES)]
         self._sequence, self._view = sequence, view_of(frames)
         self._finder = ToolFinder()
+        height, width = self._view.shape
+        scale = WORK_PX / max(height, width)
+        # (w, h), the same for a frame at full and at half resolution, which round differently.
+        self._size = max(1, round(width * scale)), max(1, round(height * scale))
         self._tissue: BoundedCache[NDArray[np.bool_]] = BoundedCache(cache_bytes() // 4, lambda found: found.nbytes)
 
     def counted(self, frame: TrainingFrame, color: Tensor) -> TrainingFrame:
-        """The frame without the pixels that show a missed tool.
-
-        Args:
-            color: (H, W, 3) the rendered frame, in [0, 1].
-        """
-        mask, size = frame.tissue_mask.cpu().numpy(), self._size(WORK_PX)
+        """The frame without the pixels that show a missed tool; `color` (H, W, 3) is the rendered frame, in [0, 1]."""
+        mask, size = frame.tissue_mask.cpu().numpy(), self._size
         rendered, target = (_resized(x.detach().cpu().numpy(), size) for x in (color, frame.rgb))
         tissue, view = (_resized_mask(x, size) for x in (mask, self._view))
         surely_tissue = self._tissue.get(frame.index, lambda: self._surely_tissue(frame.index, size))
@@ -129,12 +119,6 @@ class MaskDoubt:
         log_odds = self._finder.log_odds(self._sequence.frame(index).rgb_u8, self._view, mirrored=False)
         return _resized(log_odds, size) < SURELY_TISSUE
 
-    def _size(self, longer_px: int) -> tuple[int, int]:
-        """(w, h) with that longer side: one for a frame at full and at half resolution, which round differently."""
-        height, width = self._view.shape
-        scale = longer_px / max(height, width)
-        return max(1, round(width * scale)), max(1, round(height * scale))
-
 
 def _resized(image: NDArray, size: tuple[int, int]) -> NDArray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR)
@@ -144,30 +128,12 @@ def _resized_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.
     return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
-VISITS = 4
-"""Number of visits that are kept of each frame: early ones show what the scene had not learned yet."""
-LEAST_SHARE = 0.005
-"""Share of the view above which a visit speaks for a missed tool: about 40 px square at 640x512."""
-LEAST_VISITS = 2
-"""So many of the last visits must; a single one may be a highlight."""
-
-
 def record_visit(shares: Tensor, position: int, share: float) -> None:
-    """Append a visit of frame number `position`, and forget its oldest one.
-
-    Args:
-        shares: (F, VISITS) oldest first; changed in place.
-        share: of the view that did not count, 0..1.
-    """
+    """Append the share of the view that did not count to those of a frame, (F, VISITS), and forget its oldest one."""
     shares[position] = torch.cat((shares[position, 1:], shares.new_tensor([share])))
 
 
 def missed_tool_frames(shares: Tensor, indices: Sequence[int]) -> tuple[int, ...]:
-    """The frames whose masks likely miss a tool, ascending.
-
-    Args:
-        shares: (F, VISITS).
-        indices: number of each training frame in the sequence.
-    """
+    """Those of the training frames `indices` whose masks likely miss a tool, by their `shares` (F, VISITS)."""
     often = (shares > LEAST_SHARE).sum(1) >= LEAST_VISITS
     return tuple(index for index, missed in zip(indices, often.tolist(), strict=True) if missed)

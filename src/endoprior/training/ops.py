@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from ..model import ops as model_ops
-from . import adam, adam_numba, density, density_numba, losses, losses_numba, temporal, temporal_numba
+from . import adam, density_stats, local_motion, losses
 
 
 @dataclass(frozen=True)
@@ -19,38 +20,38 @@ class TrainingOps:
     """One implementation of each operation; those in PyTorch document them."""
 
     model: model_ops.ModelOps
-    supervised_losses: Callable
-    local_consistency: Callable
-    add_gradient: Callable
-    add_score: Callable
-    valid_projection: Callable
-    count_unusable: Callable
-    count_unusable_in_planes: Callable
-    adam_step: Callable
-    adam_basis_step: Callable
-    adam_planes_step: Callable
+    supervised_losses: Callable[..., Tensor]
+    local_consistency: Callable[..., tuple[Tensor, Tensor]]
+    add_gradient: Callable[..., None]
+    add_score: Callable[..., None]
+    valid_projection: Callable[..., Tensor]
+    count_unusable: Callable[..., int | Tensor]
+    count_unusable_in_planes: Callable[..., int | Tensor]
+    adam_step: Callable[..., None]
+    adam_basis_step: Callable[..., None]
+    adam_planes_step: Callable[..., None]
 
 
 NUMBA = TrainingOps(
     model=model_ops.NUMBA,
-    supervised_losses=losses_numba.supervised_losses,
-    local_consistency=temporal_numba.local_consistency,
-    add_gradient=density_numba.add_gradient,
-    add_score=density_numba.add_score,
-    valid_projection=density_numba.valid_projection,
-    count_unusable=adam_numba.count_unusable,
-    count_unusable_in_planes=adam_numba.count_unusable_in_planes,
-    adam_step=adam_numba.adam_step,
-    adam_basis_step=adam_numba.adam_basis_step,
-    adam_planes_step=adam_numba.adam_planes_step,
+    supervised_losses=losses.supervised_losses_numba,
+    local_consistency=local_motion.local_consistency_numba,
+    add_gradient=density_stats.add_gradient_numba,
+    add_score=density_stats.add_score_numba,
+    valid_projection=density_stats.valid_projection_numba,
+    count_unusable=adam.count_unusable_numba,
+    count_unusable_in_planes=adam.count_unusable_in_planes_numba,
+    adam_step=adam.adam_step_numba,
+    adam_basis_step=adam.adam_basis_step_numba,
+    adam_planes_step=adam.adam_planes_step_numba,
 )
 TORCH = TrainingOps(
     model=model_ops.TORCH,
     supervised_losses=losses.supervised_losses,
-    local_consistency=temporal.local_consistency,
-    add_gradient=density.add_gradient,
-    add_score=density.add_score,
-    valid_projection=density.valid_projection,
+    local_consistency=local_motion.local_consistency,
+    add_gradient=density_stats.add_gradient,
+    add_score=density_stats.add_score,
+    valid_projection=density_stats.valid_projection,
     count_unusable=adam.count_unusable,
     count_unusable_in_planes=adam.count_unusable_in_planes,
     adam_step=adam.adam_step,

@@ -13,15 +13,13 @@ from torch import Tensor
 from ..core.config import Config, OptimConfig
 from ..model.gaussians import ATTRIBUTES, Gaussians, offset_widths
 from ..model.motion import Field, UnstoredGradient
-from .adam import AdamState, PlaneAdam
-from .adam_numba import adam_unstored_step
+from ..system.arrays_file import part
+from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import LARGEST_GRADIENT
 from .ops import TrainingOps
 
-Rate = Callable[[int], float]
-"""Learning rate at an iteration (1-based, within the stage)."""
-PLANES = "planes"
-"""Name of the planes of a field, among the names of parameters."""
+Rate = Callable[[int], float]  # learning rate at an iteration (1-based, within the stage)
+PLANES = "planes"  # name of the planes of a field, among the names of parameters
 RATES = {
     "sh_dc": 2.5e-3,
     "sh_rest": 1.25e-4,
@@ -31,19 +29,14 @@ RATES = {
     "box": 1.6e-3,
 }
 """Initial rates that no config sets: those of 3DGS, and of EndoGaussian's planes and box."""
-NETWORK_LR = 1.6e-4
-"""Initial rate of trunk and heads (EndoGaussian)."""
-FINAL_SHARE = 0.01
-"""Share of the rates of centers, network and planes that is left at `decay_iterations`; log-linear in between."""
-BASIS_OPACITY_LR = 2e-2
-"""Rate of the temporal coefficients of opacities."""
-BASIS_DECAY = 0.1
-"""Share of the rates of temporal coefficients that is left at `decay_iterations`; log-linear in between."""
+NETWORK_LR = 1.6e-4  # initial rate of trunk and heads (EndoGaussian)
+FINAL_SHARE = 0.01  # of the rates of centers, network and planes, left at `decay_iterations`; log-linear in between
+BASIS_OPACITY_LR = 2e-2  # rate of the temporal coefficients of opacities
+BASIS_DECAY = 0.1  # share of the rates of temporal coefficients left at `decay_iterations`; log-linear in between
 EPSILON, BASIS_EPSILON = 1e-15, 1e-7
 """Adam's epsilon, and that for temporal coefficients: else the faint gradient that leaks to what tools hide would move
 it as fast as any other."""
-LATE = 0.75
-"""Share of `decay_iterations` after which the rates without a final value begin to fall."""
+LATE = 0.75  # share of `decay_iterations` after which the rates without a final value begin to fall
 
 
 def log_linear(start: float, end: float, iteration: int, steps: int) -> float:
@@ -86,7 +79,6 @@ class Optimizer:
     def __init__(
         self, gaussians: Gaussians, field: Field | None, cfg: Config, rate_of: Callable[[str], Rate], ops: TrainingOps
     ) -> None:
-        """Args: rate_of: gives the learning rate of a parameter by name."""
         self.gaussians, self.field, self.cfg, self._ops = gaussians, field, cfg, ops
         self.states = {name: AdamState(param) for name, param in self._dense().items()}
         self.rates = {name: rate_of(name) for name in self.states}
@@ -103,27 +95,27 @@ class Optimizer:
             iteration: 1-based, within the stage.
             skip: () float32 on a device; where it is 1 the gradients are only cleared.
         """
-        epsilon, by_rate = EPSILON, defaultdict(list)
+        by_rate: dict[float, list[tuple[AdamState, Tensor]]] = defaultdict(list)
         for name, param in self._dense().items():
             if param.grad is not None and param.numel():
                 by_rate[self.rates[name](iteration)].append((self.states[name], param))
         for rate, group in by_rate.items():
-            self._ops.adam_step([state for state, _ in group], [param for _, param in group], rate, epsilon, skip)
+            self._ops.adam_step([state for state, _ in group], [param for _, param in group], rate, EPSILON, skip)
         if self.gaussians.motion_gradients and len(self.gaussians):
             self._step_motion(iteration, skip)
-        if self.planes and any(param.grad is not None for param in self.field.parameters.values()):
+        if self.planes and self.field and any(param.grad is not None for param in self.field.parameters.values()):
             self._ops.adam_planes_step(self.planes, self.rates[PLANES](iteration), skip)
         self._clear_dense()
 
     def _step_motion(self, iteration: int, skip: Tensor | None) -> None:
         gaussians, gradients = self.gaussians, self.gaussians.motion_gradients
-        if isinstance(gradients[0], UnstoredGradient):
-            names = gradients[0].names
+        if unstored := [gradient for gradient in gradients if isinstance(gradient, UnstoredGradient)]:
+            names = unstored[0].names
             states, params = [self.states[name] for name in names], [gaussians[name] for name in names]
-            adam_unstored_step(states, params, gradients, self.rates[names[0]](iteration), EPSILON)
+            adam_unstored_step(states, params, unstored, self.rates[names[0]](iteration), EPSILON)
         else:
-            rates, epsilon = motion_rates(self.cfg, iteration), BASIS_EPSILON
-            self._ops.adam_basis_step(self.states["motion"], gaussians["motion"], gradients, rates, epsilon, skip)
+            state, rates = self.states["motion"], motion_rates(self.cfg, iteration)
+            self._ops.adam_basis_step(state, gaussians["motion"], gradients, rates, BASIS_EPSILON, skip)
 
     def count_unusable(self) -> dict[str, int | Tensor]:
         """How many entries of each gradient are not finite or too large to be squared, by name."""
@@ -131,14 +123,14 @@ class Optimizer:
         found |= {f"motion, time step {i}": g.v_offsets for i, g in enumerate(self.gaussians.motion_gradients)}
         counts = {name: self._ops.count_unusable(grad, LARGEST_GRADIENT) for name, grad in found.items()}
         if self.planes:
-            counts["planes"] = self._ops.count_unusable_in_planes(self.field.grid, LARGEST_GRADIENT)
+            counts["planes"] = self._ops.count_unusable_in_planes(self.planes.grid, LARGEST_GRADIENT)
         return counts
 
     def drop_gradients(self) -> None:
         """Drop every gradient of an iteration that is not to be applied."""
         self._clear_dense()
         if self.planes:
-            self.field.grid.clear_grads()
+            self.planes.grid.clear_grads()
 
     def state_arrays(self) -> dict[str, Tensor]:
         """Moments and step counts by name, for a checkpoint."""
@@ -147,8 +139,7 @@ class Optimizer:
     def load_state_arrays(self, arrays: dict[str, Tensor]) -> None:
         """Inverse of `state_arrays`."""
         for name, state in self._all_states():
-            prefix = f"{name}."
-            state.load({key.removeprefix(prefix): v for key, v in arrays.items() if key.startswith(prefix)})
+            state.load(part(arrays, f"{name}."))
 
     def _all_states(self) -> list[tuple[str, AdamState | PlaneAdam]]:
         return [*self.states.items(), *([("plane_adam", self.planes)] if self.planes else [])]

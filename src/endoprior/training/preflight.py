@@ -18,20 +18,16 @@ from ..initialization.sampling import has_surface
 from ..model.method import method_of
 from ..model.presets import preset, preset_names
 from ..system.memory import available_bytes
+from .gaussian_method import GaussianMethod
 
 
 def reject_ignored_options(cfg: Config) -> None:
-    """Reject a value that has no effect with the method of a config.
-
-    Raises:
-        InputError: names the option, and the only value that its method takes.
-    """
+    """Raise InputError for an option that the method of a config does not use; it names the only value to take."""
     method = method_of(cfg)
     only = dict(method.only)
-    if method.has_gaussians and not method.uses_prior:
-        only["temporal.weight"] = 0.0  # the term weighs Gaussians by the prior
-    if method.has_gaussians and not method.starts_from_flow:
-        only["init.motion"] = "rest"
+    if isinstance(method, GaussianMethod):
+        only |= {} if method.uses_prior else {"temporal.weight": 0.0}  # the term weighs Gaussians by the prior
+        only |= {} if method.starts_from_flow else {"init.motion": "rest"}
     for name, value in only.items():
         section, _, field = name.partition(".")
         got = getattr(getattr(cfg, section), field)
@@ -42,64 +38,58 @@ def reject_ignored_options(cfg: Config) -> None:
 
 def note_on_budget(cfg: Config) -> str | None:
     """A line for the user if `init.budget` was set and has no effect; not an error, as benchmark specs set it."""
-    method = method_of(cfg)
+    has_gaussians, share = _start(cfg)
     usual = preset(cfg.method) if cfg.method in preset_names() else cfg
-    if (method.has_gaussians and not method.first_share) or cfg.init.budget == usual.init.budget:
+    if (has_gaussians and not share) or cfg.init.budget == usual.init.budget:
         return None
-    start = "starts from the pixels of frames" if method.has_gaussians else "has no Gaussians"
+    start = "starts from the pixels of frames" if has_gaussians else "has no Gaussians"
     return f"init.budget {cfg.init.budget} (--gaussians) has no effect: {cfg.method} {start}"
 
 
 FLOAT = 4
-PICTURE_BYTES = 150
-"""Per pixel: a decoded frame, its prior, a rendered image and its gradients."""
-LEAST_BYTES = 300 * 2**20
-"""Compiled kernels, lists of the renderer, buffers of the libraries."""
-MOMENTS = 2
-"""Adam keeps two numbers of each parameter."""
-TRACK_BYTES = 64
-"""Per point and frame while motion is fitted: pixel, position and offset in float64."""
+PICTURE_BYTES = 150  # per pixel: a decoded frame, its prior, a rendered image and its gradients
+LEAST_BYTES = 300 * 2**20  # compiled kernels, lists of the renderer, buffers of the libraries
+MOMENTS = 2  # Adam keeps two numbers of each parameter
+TRACK_BYTES = 64  # per point and frame while motion is fitted: pixel, position and offset in float64
 
 
 def first_count(sequence: FrameSequence, cfg: Config) -> int:
     """Gaussians that training starts with, about; 0 for a method that has none."""
-    method = method_of(cfg)
-    if not method.has_gaussians:
-        return 0
-    if not method.first_share:
-        return cfg.init.budget
+    has_gaussians, share = _start(cfg)
+    if not has_gaussians or not share:
+        return cfg.init.budget if has_gaussians else 0
     first = sequence.frame(sequence.indices("train")[0])
-    return round(method.first_share * np.count_nonzero(first.tissue_mask & has_surface(first)))
+    return round(share * np.count_nonzero(first.tissue_mask & has_surface(first)))
+
+
+def _start(cfg: Config) -> tuple[bool, float]:
+    """Whether the method of a config has Gaussians, and its `first_share`."""
+    method = method_of(cfg)
+    return method.has_gaussians, method.first_share if isinstance(method, GaussianMethod) else 0.0
 
 
 def least_bytes(cfg: Config, num: int, num_train: int, width: int, height: int) -> int:
-    """Memory that training needs beyond what the process uses already.
+    """Memory that training needs beyond what the process uses already, with `num` first Gaussians.
 
     Args:
-        cfg: fitted to the sequence (`Config.fitted`).
-        num: first Gaussians.
-        num_train: training frames.
-        width, height: of a frame, px.
+        cfg: fitted to the sequence (`Config.fitted`). width, height: of its `num_train` frames, px.
     """
+    schema = method_of(cfg).schema(cfg)
     sizes = {
-        name: FLOAT * math.prod(num if length == "N" else length for length in spec.shape)
-        for name, spec in method_of(cfg).schema(cfg).items()
-        if name.startswith(("gaussians.", "field."))
+        name: FLOAT * math.prod(length if isinstance(length, int) else num for length in spec.shape)
+        for name, spec in schema.items()
     }
-    motion = sizes.get("gaussians.motion", 0)
-    state = (1 + MOMENTS) * sum(sizes.values())
+    gaussians = [size for name, size in sizes.items() if name.startswith("gaussians.")]
+    fields = [size for name, size in sizes.items() if name.startswith("field.")]
+    state = (1 + MOMENTS) * sum(gaussians + fields)
     # Growing and pruning copy a tensor twice; tracks are there before the moments are.
-    growing = 2 * max((size for name, size in sizes.items() if name.startswith("gaussians.")), default=0)
+    growing, motion = 2 * max(gaussians, default=0), sizes.get("gaussians.motion", 0)
     tracks = TRACK_BYTES * num_train * num + motion if cfg.init.motion == "flow" and motion else 0
     return LEAST_BYTES + PICTURE_BYTES * width * height + max(state + growing, tracks)
 
 
 def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
-    """Reject a training that the free memory cannot hold.
-
-    Raises:
-        InputError: it needs more than there is; with both numbers.
-    """
+    """Raise InputError, with both numbers, for a training that needs more than the free memory."""
     free = available_bytes()
     camera, num_train, num = sequence.camera(0), len(sequence.indices("train")), first_count(sequence, cfg)
     least = least_bytes(cfg.fitted(len(sequence)), num, num_train, camera.width, camera.height)

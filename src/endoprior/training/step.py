@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,19 +21,27 @@ from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrame, TrainingFrames
-from .losses import color_l1
+from .losses import color_l1, track_term
 from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
 from .ops import TrainingOps
-from .stage import Stage, StepReport, stage_length
 from .temporal import temporal_terms
-from .track_loss import track_term
+from .trainer import Stage, StepReport, stage_length
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
     from .gaussian_trainer import GaussiansState
 
-RESET_OPACITY = 0.01
-"""Where methods that reset opacities lower them to (3DGS)."""
+RESET_OPACITY = 0.01  # where methods that reset opacities lower them to (3DGS)
+MAX_SCALE_SHARE = 0.025
+"""Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned."""
+
+
+class Before(NamedTuple):
+    """The training frame just before, with which the temporal term compares."""
+
+    frame: TrainingFrame
+    tissue_now: Tensor  # (H, W) bool: the tissue mask of the rendered frame, missed tools included
+    means: Tensor | None  # (N, 3) centers at the frame before, mm, where they are known already
 
 
 @dataclass(frozen=True)
@@ -41,33 +49,19 @@ class Drawn:
     """A training frame that was rendered, and what it was rendered from: what the loss of a method sees."""
 
     stage: Stage
-    iteration: int
-    """1-based, within the stage."""
-    position: int
-    """Place of the frame among the training frames."""
-    frame: TrainingFrame
-    """What is compared: `unmasked` without the pixels that show a tool in spite of the mask."""
+    iteration: int  # 1-based, within the stage
+    position: int  # place of the frame among the training frames
+    frame: TrainingFrame  # what is compared: without the pixels that show a tool in spite of the mask
     gaussians: Gaussians
     field: Field | None
-    offsets: Offsets | None
-    """What moved them; None in the coarse stage."""
-    splats: Splats
-    """The Gaussians as they were rendered."""
+    offsets: Offsets | None  # what moved them; None in the coarse stage
+    splats: Splats  # the Gaussians as they were rendered
     out: RenderOutput
-    draw: Callable[[Splats], RenderOutput]
-    """Renders other Gaussians from the same camera."""
-    context: Any
-    """What the method's `context` made of all training frames."""
-    unmasked: TrainingFrame | None = None
-    """The frame as it is in the sequence; it goes with `before`."""
-    before: TrainingFrame | None = None
-    """The frame before, where the temporal term takes part."""
-    means_before: Tensor | None = None
-    """(N, 3) centers at the frame before, mm, if they are known already."""
-    is_right: bool = False
-    """Of the right eye: only its picture and depth are compared."""
-    left_out: float | None = None
-    """Share of the view that does not count as it shows a missed tool; None where that was not asked."""
+    draw: Callable[[Splats], RenderOutput]  # renders other Gaussians from the same camera
+    context: Any  # what the method's `context` made of all training frames
+    before: Before | None = None  # the frame before, where the temporal term takes part
+    is_right: bool = False  # of the right eye: only its image and depth are compared
+    left_out: float | None = None  # share of the view that shows a missed tool; None where that was not asked
 
 
 @dataclass
@@ -78,19 +72,15 @@ class TrainingStep:
     """
 
     method: GaussianMethod
-    motion: Motion
-    """That of the method."""
+    motion: Motion  # that of the method
     cfg: Config
     frames: TrainingFrames
-    camera_centers: Tensor
-    """(T, 3) camera positions of the training frames, mm."""
+    extent: float  # see `density.scene_extent`
     rasterize: Rasterizer
     ops: TrainingOps
     check: DivergenceCheck
-    doubt: MaskDoubt | None = None
-    """Takes missed tools out of the frames; None trusts the masks."""
-    background: Tensor = field(default_factory=lambda: torch.zeros(3))
-    """(3,) color behind everything."""
+    doubt: MaskDoubt | None  # takes missed tools out of the frames; None trusts the masks
+    background: Tensor  # (3,) color behind everything
 
     @cached_property
     def context(self) -> Any:
@@ -100,14 +90,12 @@ class TrainingStep:
     def __call__(self, state: GaussiansState) -> StepReport:
         """One iteration.
 
-        Where the report has a `divergence`, the state is the one after the last good iteration.
-
         Raises:
-            Diverged: no Gaussian is left, or a split would give one of infinite size. The state is then the one before
-                density control.
+            Diverged: the loss or a gradient is not finite, or the images show nothing: the state is then the one after
+                the last good iteration. Or no Gaussian is left, or a split would give one of infinite size: the state
+                is then the one before density control.
         """
-        began, cfg, method = clock.perf_counter(), self.cfg, self.method
-        iteration = state.iteration + 1
+        began, cfg, method, iteration = clock.perf_counter(), self.cfg, self.method, state.iteration + 1
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
         fine, last = state.stage is Stage.FINE, iteration == stage_length(cfg, state.stage)
         densify = method.density_due(state.stage, iteration, last, cfg)
@@ -116,29 +104,30 @@ class TrainingStep:
 
         drawn = self.draw(state, rng)
         terms, color_error = self.loss(state, drawn)
-        sum(terms.values()).backward()
+        sum(terms.values(), torch.zeros(())).backward()
         unusable, empty_error = state.optimizer.count_unusable(), method.empty_error(drawn.frame.brightness)
         wait = densify or reset or last
-        divergence = self.check.after_backward(iteration, terms, unusable, color_error, empty_error, wait=wait)
-        event: dict[str, int] | None = None
-        if divergence is not None:
+        try:
+            self.check.after_backward(iteration, terms, unusable, color_error, empty_error, wait=wait)
+        except Diverged as error:
             state.optimizer.drop_gradients()
-            state.iteration = divergence.last_good
-        else:
-            with torch.no_grad():
-                self._observe(state, drawn)
-                self._update(state, drawn)
-                state.iteration = iteration  # what follows may raise, and must leave a state that can be resumed
-                if densify:
-                    event = self._densify(state, iteration, rng)
-                if reset:
-                    density.reset_opacities(state.optimizer, RESET_OPACITY)
+            state.iteration = error.last_good
+            raise
+        event: dict[str, int] | None = None
+        with torch.no_grad():
+            self._observe(state, drawn)
+            self._update(state, drawn)
+            state.iteration = iteration  # what follows may raise, and must leave a state that can be resumed
+            if densify:
+                event = self._densify(state, iteration, rng)
+            if reset:
+                density.reset_opacities(state.optimizer, RESET_OPACITY)
         losses = {name: value.detach() for name, value in terms.items()}
         seconds = clock.perf_counter() - began
         missed = None
         if fine and last and state.left_out is not None:
             missed = missed_tool_frames(state.left_out, self.frames.indices)
-        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, divergence, missed)
+        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, missed)
 
     def draw(self, state: GaussiansState, rng: np.random.Generator) -> Drawn:
         """Batch, deform, render; nothing is changed. `rng` belongs to the iteration."""
@@ -147,50 +136,31 @@ class TrainingStep:
         is_right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
         half = fine and iteration <= cfg.schedule.half_resolution_iterations
         frame = counted = self.frames.frame(position, half=half, right=is_right)
-        before = None
+        previous = None
         if fine and not is_right and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
-            before = self.frames.before(position)
+            previous = self.frames.before(position)
 
-        gaussians, model_ops = state.gaussians, self.ops.model
-        offsets = means_before = None
-        if fine and before and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
-            offsets, displacement = state.field.offsets_and_displacement(
-                gaussians["means"], frame.time, before.time, model_ops
-            )
-            means_before = gaussians["means"] + displacement
+        gaussians, model_ops, offsets, means_before = state.gaussians, self.ops.model, None, None
+        if fine and previous and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
+            means = gaussians["means"]
+            offsets, moved = state.field.offsets_and_displacement(means, frame.time, previous.time, model_ops)
+            means_before = means + moved
         elif fine:
             offsets = self.motion.offsets(gaussians, state.field, frame.time, cfg, model_ops)
         splats = gaussians.splats(offsets, sh_degree(cfg, state.stage, iteration))
 
-        draw = partial(
-            self.rasterize,
-            camera=frame.camera,
-            background=self.background,
-            depth_grad_to_means=cfg.render.depth_grad_to_means,
-        )
+        depth_grad = cfg.render.depth_grad_to_means
+        draw = partial(self.rasterize, camera=frame.camera, background=self.background, depth_grad_to_means=depth_grad)
         out = draw(splats)
         out.means2d.retain_grad()
         left_out = None
         if self.doubt and fine and not is_right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(frame, out.color)
             left_out = self.doubt.share(frame, counted)
+        before = previous and Before(previous, frame.tissue_mask, means_before)
+        moved_by = (gaussians, state.field, offsets, splats)
         return Drawn(
-            stage=state.stage,
-            iteration=iteration,
-            position=position,
-            frame=counted,
-            unmasked=frame,
-            before=before,
-            is_right=is_right,
-            left_out=left_out,
-            gaussians=gaussians,
-            field=state.field,
-            offsets=offsets,
-            means_before=means_before,
-            splats=splats,
-            out=out,
-            draw=draw,
-            context=self.context,
+            state.stage, iteration, position, counted, *moved_by, out, draw, self.context, before, is_right, left_out
         )
 
     def loss(self, state: GaussiansState, drawn: Drawn) -> tuple[dict[str, Tensor], Tensor]:
@@ -204,7 +174,7 @@ class TrainingStep:
             term = track_term(means, drawn.offsets.means, state.tracks, frame, drawn.position, basis, self.ops)
             terms |= {"track": cfg.loss.track_weight * term}
         if drawn.before is not None:
-            terms |= temporal_terms(drawn, self.motion, state.stats, cfg, self.ops)
+            terms |= temporal_terms(drawn, drawn.before, self.motion, state.stats, cfg, self.ops)
         return terms, error
 
     def _observe(self, state: GaussiansState, drawn: Drawn) -> None:
@@ -227,9 +197,7 @@ class TrainingStep:
             limit_scales(log_scales, drawn.splats.means, drawn.frame.camera, MAX_SCALE_SHARE)
 
     def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
-        gaussians = state.gaussians
-        extent = density.scene_extent(self.camera_centers)
-        planned = self.method.plan(state.stats, gaussians, extent, state.stage, iteration, self.cfg)
+        planned = self.method.plan(state.stats, state.gaussians, self.extent, state.stage, iteration, self.cfg)
         if bool(planned.remove.all()):
             lost = f"after iteration {iteration} all {len(planned.remove):,} faded"
             raise Diverged(f"expected Gaussians that explain the frames; {lost}. {ADVICE}")
@@ -244,10 +212,6 @@ def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
     if stage is Stage.FINE:
         done += cfg.schedule.coarse_iterations // cfg.schedule.sh_every
     return min(done, cfg.schedule.sh_degree)
-
-
-MAX_SCALE_SHARE = 0.025
-"""Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned."""
 
 
 def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float) -> None:

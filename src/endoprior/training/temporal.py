@@ -1,8 +1,7 @@
 """Texture-aware temporal consistency: neighbors move together, the more so the better their texture. Eqs. (9)-(11).
 
-First which Gaussians take part in an iteration, with which motion weights, and where they were before; then the term
-itself in PyTorch, for any device (`temporal_numba.py` computes the same). `N` Gaussians of the scene, `P` of them
-chosen, `K` neighbors of each. "now" is frame t, "before" the adjacent training frame t - dt.
+Which Gaussians take part in an iteration, with which motion weights, and where they were before; `local_motion.py` has
+the term itself. `N` Gaussians of the scene, `P` of them chosen.
 """
 
 from __future__ import annotations
@@ -17,45 +16,25 @@ from torch import Tensor
 from ..core.config import Config, TemporalConfig
 from ..core.geometry import project
 from ..model.motion import Motion
-from .density import DensityStats
+from .density_stats import DensityStats
 from .frames import TrainingFrame
+from .local_motion import NUM_NEIGHBORS
 
 if TYPE_CHECKING:
     from .ops import TrainingOps
-    from .step import Drawn
+    from .step import Before, Drawn
 
-NUM_NEIGHBORS = 8
-"""K."""
-DISPLACEMENT_WEIGHT, DISTANCE_WEIGHT = 1.0, 0.2
-"""lambda_disp and lambda_dist."""
-HUBER_DELTA = 0.01
-"""delta of Huber's penalty, mm."""
-MOTION_THRESHOLD, MOTION_TEMPERATURE = 0.45, 0.08
-"""tau_m and gamma_m of Eq. (9)."""
-MOST_POINTS = 1024
-"""Gaussians that are sampled by weight for an iteration that trains one time."""
-MIN_EFFECTIVE = 256
-"""Effective sample size that the released code relaxes the weights for."""
-MIN_WEIGHT = 1e-4
-"""Motion weights up to this are treated as zero (released code)."""
+DISPLACEMENT_WEIGHT, DISTANCE_WEIGHT = 1.0, 0.2  # lambda_disp and lambda_dist
+MOTION_THRESHOLD, MOTION_TEMPERATURE = 0.45, 0.08  # tau_m and gamma_m of Eq. (9)
+MOST_POINTS = 1024  # Gaussians that are sampled by weight for an iteration that trains one time
+MIN_EFFECTIVE = 256  # effective sample size that the released code relaxes the weights for
+MIN_WEIGHT = 1e-4  # motion weights up to this are treated as zero (released code)
 EVALUATIONS, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
 RELAX_THRESHOLD_FLOOR, RELAX_TEMPERATURE_CAP = 0.25, 0.30
-SQRT_EPS = 1e-8
-"""Under the root of the displacement norm, mm**2: a finite gradient at zero."""
-SUM_EPS = 1e-8
-"""Least pair weight, and least sum of them; a larger one would silence the term: typical weights are near 0.002."""
-POINTS_AT_A_TIME = 4096
-"""Points whose distances to all others are held at once."""
 
 
 def motion_weight(score: NDArray, threshold: float, temperature: float) -> NDArray:
-    """w^mot = sigmoid((s - tau_m) / gamma_m), Eq. (9).
-
-    Args:
-        score: (N,) texture-prior scores in [0, 1].
-    Returns:
-        (N,) in (0, 1).
-    """
+    """(N,) w^mot = sigmoid((s - tau_m) / gamma_m) of texture-prior scores s (N,), Eq. (9)."""
     with np.errstate(over="ignore"):  # 1 / infinity is the right weight of a score far below the threshold
         return 1 / (1 + np.exp(-(score - threshold) / temperature))
 
@@ -67,12 +46,9 @@ def effective_size(weights: NDArray) -> float:
 
 
 def kept_motion_weight(score: NDArray, relaxed: bool = False) -> NDArray:
-    """Eq. (9); `relaxed` lowers tau_m and raises gamma_m until enough Gaussians count (released code).
+    """(N,) weights of Eq. (9) by `score` (N,) of candidates; those up to `MIN_WEIGHT` are 0.
 
-    Args:
-        score: (N,) in [0, 1], of the candidates only: others must not count as effective.
-    Returns:
-        (N,) weights; those up to `MIN_WEIGHT` are 0.
+    `relaxed` lowers tau_m and raises gamma_m until enough Gaussians count (released code).
     """
     threshold, temperature = MOTION_THRESHOLD, MOTION_TEMPERATURE
     weights = motion_weight(score, threshold, temperature)
@@ -110,12 +86,10 @@ def systematic_sample(weights: NDArray, count: int, refill: bool = False) -> NDA
 def choose(
     score: NDArray, eligible: NDArray, cfg: TemporalConfig, released: bool = False
 ) -> tuple[NDArray[np.intp], NDArray]:
-    """The Gaussians that take part in one iteration, and their motion weights.
+    """The Gaussians that take part in one iteration (P,), and their motion weights; none if too few qualify.
 
     Args:
         score: (N,) in [0, 1]. eligible: (N,) bool, the set S_t.
-    Returns:
-        (P,) indices and (P,) weights; P = 0 when fewer than `least_points` qualify.
     """
     candidates = np.flatnonzero(eligible)
     score = score[candidates]
@@ -132,14 +106,14 @@ def least_points(cfg: TemporalConfig) -> int:
 
 
 def temporal_terms(
-    drawn: Drawn, motion: Motion, stats: DensityStats, cfg: Config, ops: TrainingOps
+    drawn: Drawn, before: Before, motion: Motion, stats: DensityStats, cfg: Config, ops: TrainingOps
 ) -> dict[str, Tensor]:
-    """L_local of Eq. (11), weighted, () each; nothing with few Gaussians. `drawn` has a frame before."""
-    temporal, out, means, before = cfg.temporal, drawn.out, drawn.splats.means, drawn.before
+    """L_local of Eq. (11), weighted, () each; nothing with few Gaussians."""
+    temporal, out, means = cfg.temporal, drawn.out, drawn.splats.means
     seen = out.radii > 0
     both = temporal.gradient == "both"
     if both:
-        seen = ops.valid_projection(out.means2d, out.radii, drawn.unmasked.tissue_mask)
+        seen = ops.valid_projection(out.means2d, out.radii, before.tissue_now)
     eligible = seen & (stats.num_valid >= temporal.min_valid)
     score = stats.score(cfg.released.unobserved_score)
     index, weights = (
@@ -148,9 +122,9 @@ def temporal_terms(
     )
     if not len(index):
         return {}
-    earlier = _means_before(drawn, motion, index, cfg, ops)
+    earlier = _means_before(drawn, before, motion, index, cfg, ops)
     if both:
-        kept = _on_tissue(earlier.detach(), before, ops)
+        kept = _on_tissue(earlier.detach(), before.frame, ops)
         index, weights, earlier = index[kept], weights[kept], earlier[kept]
         if len(index) < least_points(temporal):
             return {}
@@ -161,11 +135,11 @@ def temporal_terms(
     }
 
 
-def _means_before(drawn: Drawn, motion: Motion, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
+def _means_before(drawn: Drawn, before: Before, motion: Motion, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
     """(P, 3) centers of the chosen Gaussians at the frame before, with a gradient only if that end is trained."""
-    if drawn.means_before is not None:
-        return drawn.means_before[index]
-    means, known = drawn.gaussians["means"], (drawn.gaussians, drawn.field, drawn.before.time, cfg, ops.model)
+    if before.means is not None:
+        return before.means[index]
+    means, known = drawn.gaussians["means"], (drawn.gaussians, drawn.field, before.frame.time, cfg, ops.model)
     if cfg.temporal.gradient == "both":
         # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
         return (means + motion.offsets(*known).means)[index]
@@ -178,63 +152,3 @@ def _on_tissue(points: Tensor, frame: TrainingFrame, ops: TrainingOps) -> Tensor
     pixels, z = project(points.cpu().numpy(), frame.camera)
     means2d, in_front = torch.from_numpy(pixels.astype(np.float32)), torch.from_numpy(z > 0).int()
     return ops.valid_projection(means2d.to(points.device), in_front.to(points.device), frame.tissue_mask)
-
-
-def local_consistency(now: Tensor, before: Tensor, weights: Tensor, smooth_l1: bool = False) -> tuple[Tensor, Tensor]:
-    """L_local, Eq. (11), unweighted: neighbors are found and weighed at t - dt, then compared.
-
-    Args:
-        now, before: (P, 3) deformed centers at t and t - dt, mm, P > K. Detach `before` to train one end only.
-        weights: (P,) motion weights > 0, from `temporal.choose`.
-    Returns:
-        Mean |d_i - d_j| (mm) and mean Huber penalty of the change of |mu_i - mu_j|, both weighted by w_ij.
-    """
-    indices, distances = neighbors(before.detach(), NUM_NEIGHBORS)
-    return local_motion(now, before, indices, affinity(distances, indices, weights), smooth_l1)
-
-
-def neighbors(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """(P, k) indices of the nearest other points of each of (P, 3) points, nearest first, and (P, k) distances, mm."""
-    found = []
-    for start in range(0, len(points), POINTS_AT_A_TIME):
-        distances = torch.cdist(
-            points[start : start + POINTS_AT_A_TIME], points, compute_mode="donot_use_mm_for_euclid_dist"
-        )
-        distances.diagonal(start).fill_(torch.inf)
-        found.append(distances.topk(k, largest=False))
-    return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
-
-
-def affinity(distances: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
-    """(P, K) pair weights w_ij = exp(-|mu_i - mu_j|^2 / (2 sigma_loc^2)) w_i w_j, Eq. (10), floored at `SUM_EPS`.
-
-    sigma_loc, which the paper leaves open, is the median neighbor distance of the iteration (released code).
-
-    Args:
-        distances: (P, K) mm. indices: (P, K) of the neighbors. weights: (P,) motion weights.
-    """
-    sigma = distances.flatten().quantile(0.5).clamp(min=1e-8)  # as in NumPy, between the middle two of an even number
-    return ((-(distances**2) / (2 * sigma**2)).exp() * weights[:, None] * weights[indices]).clamp(min=SUM_EPS)
-
-
-def local_motion(
-    now: Tensor, before: Tensor, indices: Tensor, pair_weights: Tensor, smooth_l1: bool = False
-) -> tuple[Tensor, Tensor]:
-    """The two weighted means of Eq. (11), displacement and distance, of given (P, K) neighbors and pair weights."""
-    weight = pair_weights.to(now.dtype)
-    weight = weight / weight.sum().clamp(min=SUM_EPS)
-    displacement = now - before
-    difference = displacement[:, None] - displacement[indices]
-    apart = (difference.square().sum(-1) + SQRT_EPS).sqrt()
-    stretch = (_length(now[:, None] - now[indices]) - _length(before[:, None] - before[indices])).abs()
-    return (weight * apart).sum(), (weight * huber(stretch, HUBER_DELTA, smooth_l1)).sum()
-
-
-def huber(x: Tensor, delta: float, smooth_l1: bool = False) -> Tensor:
-    """Huber's penalty of x >= 0: x^2 / 2 up to delta, delta (x - delta / 2) above; `smooth_l1` divides it by delta."""
-    literal = torch.where(x <= delta, 0.5 * x * x, delta * (x - 0.5 * delta))
-    return literal / delta if smooth_l1 else literal
-
-
-def _length(vectors: Tensor) -> Tensor:
-    return (vectors.square().sum(-1) + SQRT_EPS**2).sqrt()

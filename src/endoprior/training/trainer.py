@@ -1,10 +1,13 @@
-"""What a training run is, whatever the method: it starts or is restored, iterates, and gives a scene."""
+"""What a training run is, whatever the method: it starts or is restored, iterates in two stages, and gives a scene."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -15,21 +18,50 @@ from ..core.config import Config
 from ..data import FrameSequence
 from ..model.scene import RenderedScene
 from ..system.arrays_file import ArraySpec
-from .stage import Stage, StepReport, stage_length
 
-DEFAULT_FRAMES_PER_SECOND = 25.0
-"""Playing speed of a sequence that does not state its own."""
+DEFAULT_FRAMES_PER_SECOND = 25.0  # playing speed of a sequence that does not state its own
 
-Observer = Callable[[StepReport, "Trainer"], None]
-"""Called after each iteration: progress, log, checkpoints, viewer."""
+
+class Stage(IntEnum):
+    """The two stages, in order."""
+
+    COARSE = 0
+    FINE = 1
+
+
+def stage_length(cfg: Config, stage: Stage) -> int:
+    """Iterations of a stage."""
+    return cfg.schedule.coarse_iterations if stage is Stage.COARSE else cfg.schedule.fine_iterations
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one iteration did."""
+
+    stage: Stage
+    iteration: int
+    """1-based, within the stage."""
+    losses: Mapping[str, Tensor]
+    """Weighted terms of the loss that took part, () each."""
+    num_gaussians: int
+    """After the iteration; 0 for a radiance field."""
+    seconds: float
+    event: Mapping[str, int] | None = None
+    """What density control did after the iteration, if it did anything: `Plan.counts`."""
+    missed_tool_frames: tuple[int, ...] | None = None
+    """After the last iteration: frames of the sequence whose masks likely miss a tool; None if masks are trusted."""
+
+    @cached_property
+    def terms(self) -> dict[str, float]:
+        """`losses` as numbers; the host waits for the device."""
+        return {name: float(value) for name, value in self.losses.items()}
 
 
 class State(Protocol):
     """What changes while training; a checkpoint holds exactly this."""
 
     stage: Stage
-    iteration: int
-    """Iterations of this stage already done."""
+    iteration: int  # iterations of this stage already done
 
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
@@ -40,11 +72,9 @@ class Trainer(ABC):
     """One training run: `start` or `restore`, then `run`; `scene` is its result so far."""
 
     sequence: FrameSequence
-    cfg: Config
-    """Fitted to the length of the sequence."""
+    cfg: Config  # fitted to the length of the sequence
     device: torch.device
-    state: Any
-    """A `State`, from `start` or `restore` on."""
+    state: State  # from `start` or `restore` on
 
     @abstractmethod
     def start(self) -> None:
@@ -82,7 +112,8 @@ class Trainer(ABC):
     @property
     def finished(self) -> bool:
         """Whether all iterations are done."""
-        return self.state.stage is Stage.FINE and self.state.iteration >= stage_length(self.cfg, Stage.FINE)
+        done, total = self.progress()
+        return done >= total
 
     def progress(self) -> tuple[int, int]:
         """Iterations done and in all, over both stages."""
@@ -100,6 +131,9 @@ class Trainer(ABC):
             report = self.step()
             for observe in observers:
                 observe(report, self)
+
+
+Observer = Callable[[StepReport, Trainer], None]  # called after each iteration: progress, log, checkpoints, viewer
 
 
 def device_for(backend: render.Backend) -> torch.device:

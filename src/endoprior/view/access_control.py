@@ -1,6 +1,6 @@
-"""Access control of the viewer: a secret token in its address, and limits of what a connection sends.
+"""Access control of the viewer: a secret token in its address, and limits of what connections send and ask for.
 
-viser has no option for either. `access_control` hands both to the web server (`websockets`) that viser starts. viser
+viser has no option for them. `access_control` hands them to the web server (`websockets`) that viser starts. viser
 also trusts every message: one could set any attribute of a control, or store parts of an upload that was not requested.
 """
 
@@ -12,9 +12,10 @@ import ipaddress
 import logging
 import math
 import socket
+import threading
 import time as clock
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from http import HTTPStatus
@@ -30,11 +31,13 @@ from ..core.checks import input_error
 from ..core.geometry import FARTHEST_MM
 
 MAX_MESSAGE_BYTES = 2**16
-"""Largest message of a browser, bytes; normal messages have a few hundred."""
+"""Largest message of a browser; normal messages have a few hundred bytes."""
 MAX_BROWSERS = 32
 """Largest number of simultaneous connections."""
 MAX_PER_SECOND = 500
 """Largest message rate of one connection; dragging sends one per screen refresh."""
+MAX_WAITING = 200
+"""Largest number of waiting jobs; a person never reaches it."""
 HEADERS = {
     # viser's page is one file of inline scripts and styles. It unpacks them with WebAssembly, and its sorter of splats
     # builds functions from text. Its workers, sorter and images are blob: or data: addresses.
@@ -48,14 +51,15 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 """Headers of every response."""
+WRONG_HOST = "Expected localhost, an IP address or the name of this machine in the address of the viewer.\n"
+WRONG_TOKEN = "Expected the address that endoprior printed when the viewer started: it has a token.\n"
+Job = Callable[[], object]
+Accepts = Callable[[str, Any], bool]
+"""Whether the control with this id can have this value."""
 
 
 def check_address(host: str, port: int) -> None:
-    """Check that the address is free; viser would silently use another port, or wait.
-
-    Raises:
-        InputError: the address cannot be used.
-    """
+    """Check that the address is free; viser would silently use another port, or wait. Raises InputError."""
     if not 0 <= port <= 65535:
         raise input_error("--port", "0 to 65535", str(port), "`--port 0` for any free port.")
     try:
@@ -72,8 +76,7 @@ def check_address(host: str, port: int) -> None:
 
 def is_open(host: str) -> bool:
     """Whether other machines can connect to a viewer that listens on this address of `check_address`."""
-    found = {answer[4][0] for answer in socket.getaddrinfo(host, None)}
-    return not all(ipaddress.ip_address(address).is_loopback for address in found)
+    return not all(ipaddress.ip_address(found[4][0]).is_loopback for found in socket.getaddrinfo(host, None))
 
 
 def is_known_host(asked: str, host: str) -> bool:
@@ -83,12 +86,9 @@ def is_known_host(asked: str, host: str) -> bool:
     """
     try:
         name = urlsplit(f"//{asked}").hostname or ""
-        if name in ("localhost", socket.gethostname().lower(), host.lower()):
-            return True
-        ipaddress.ip_address(name)
+        return name in ("localhost", socket.gethostname().lower(), host.lower()) or bool(ipaddress.ip_address(name))
     except ValueError:
         return False
-    return True
 
 
 class RateLimit:
@@ -98,27 +98,56 @@ class RateLimit:
         self._most, self._since, self._count = most, float("-inf"), 0
 
     def exceeded(self, now: float) -> bool:
-        """Count an event at `now`, s; whether there are more than `most` in this second."""
+        """Count an event at `now`, s; whether there are more than allowed in this second."""
         if now - self._since >= 1:
             self._since, self._count = now, 0
         self._count += 1
         return self._count > self._most
 
 
+class JobQueue:
+    """A bounded job queue: many threads add jobs, one thread runs them."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[Hashable, Job]] = []
+        self._changed = threading.Condition()
+
+    def put(self, job: Job, key: Hashable = None, *, surely: bool = False) -> None:
+        """Add a job. Jobs beyond `MAX_WAITING` are dropped.
+
+        Args:
+            key: only one job per key waits at a time. The job reads its state when it runs, so it uses the newest.
+            surely: never drop this job.
+        """
+        with self._changed:
+            keys = [each for each, _ in self._waiting]
+            if key in keys if key is not None else len(keys) >= MAX_WAITING and not surely:
+                return
+            self._waiting.append((key, job))
+            self._changed.notify()
+
+    def take(self, seconds: float) -> list[Job]:
+        """All waiting jobs, in order; an empty list if none arrives within `seconds`."""
+        with self._changed:
+            if not self._waiting and seconds > 0:
+                self._changed.wait(min(seconds, threading.TIMEOUT_MAX))
+            jobs, self._waiting = [job for _, job in self._waiting], []
+            return jobs
+
+
 class _LimitedConnection(web_server.ServerConnection):
     """A connection that passes on valid messages only, and ends if it floods or sends no MessagePack."""
 
-    def __init__(self, *args: Any, accepts: Callable[[str, Any], bool], **options: Any) -> None:
+    def __init__(self, *args: Any, accepts: Accepts, **options: Any) -> None:
         super().__init__(*args, **options)
         self._accepts, self._rate = accepts, RateLimit(MAX_PER_SECOND)
 
     async def recv(self, decode: bool | None = None) -> Any:
         while True:
-            raw = await super().recv(decode)
-            try:
-                message = None if self._rate.exceeded(clock.monotonic()) else msgspec.msgpack.decode(raw)
-            except (msgspec.MsgspecError, RecursionError, TypeError, UnicodeDecodeError):
-                message = None
+            raw, message = await super().recv(decode), None
+            with suppress(msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+                if isinstance(raw, bytes) and not self._rate.exceeded(clock.monotonic()):
+                    message = msgspec.msgpack.decode(raw)
             if message is None:
                 self.transport.abort()
                 raise ConnectionClosedError(None, None)
@@ -127,13 +156,12 @@ class _LimitedConnection(web_server.ServerConnection):
 
 
 @contextmanager
-def access_control(token: str, host: str, accepts: Callable[[str, Any], bool]) -> Iterator[None]:
+def access_control(token: str, host: str, accepts: Accepts) -> Iterator[None]:
     """Start the viser server within this context, to guard all of its pages and connections.
 
     Args:
         token: the path of the page, a secret.
         host: address that the server listens on.
-        accepts: whether the control with this id can have this value.
     Raises:
         RuntimeError: viser started no web server of `websockets`, so that nothing is guarded.
     """
@@ -148,11 +176,9 @@ def access_control(token: str, host: str, accepts: Callable[[str, Any], bool]) -
             path, hosts = request.path, request.headers.get_all("Host")
             given = path.partition("?")[0].strip("/").encode(errors="replace")
             if len(hosts) != 1 or not is_known_host(hosts[0], host):
-                text = "Expected localhost, an IP address or the name of this machine in the address of the viewer.\n"
-                response = connection.respond(HTTPStatus.FORBIDDEN, text)
+                response = connection.respond(HTTPStatus.FORBIDDEN, WRONG_HOST)
             elif not hmac.compare_digest(given, token.encode()):
-                text = "Expected the address that endoprior printed when the viewer started: it has a token.\n"
-                response = connection.respond(HTTPStatus.FORBIDDEN, text)
+                response = connection.respond(HTTPStatus.FORBIDDEN, WRONG_TOKEN)
             elif "Upgrade" in request.headers:
                 if len(connection.server.connections) < MAX_BROWSERS:
                     return None
@@ -197,13 +223,13 @@ KINDS = ("ViewerCameraMessage", "ScenePointerMessage", "SceneNodeDragMessage")
 FIELDS: dict[str, Callable[[Any], bool]] = {
     "wxyz": lambda value: are_numbers(value, 4, 1e3) and math.hypot(*value) > 1e-6,
     **dict.fromkeys(("position", "look_at", "up_direction"), _is_place),
+    **dict.fromkeys(("ray_origin", "ray_direction", "start_position", "end_position"), _is_place),
     "fov": lambda value: are_numbers([value], 1, 4),
     **dict.fromkeys(
         ("image_width", "image_height"), lambda value: are_numbers([value], 1, LARGEST_CANVAS) and value >= 0
     ),
     "event_type": lambda value: value == "click",
     "screen_pos": lambda value: isinstance(value, list | tuple) and len(value) == 1 and _is_on_screen(value[0]),
-    **dict.fromkeys(("ray_origin", "ray_direction", "start_position", "end_position"), _is_place),
     **dict.fromkeys(("start_screen_pos", "end_screen_pos"), _is_on_screen),
     "phase": lambda value: value in ("start", "update", "end"),
     "button": lambda value: value == "left",
@@ -215,18 +241,14 @@ FIELDS: dict[str, Callable[[Any], bool]] = {
 """For the fields of messages of these kinds, whether they can have a value. viser rejects a message without one."""
 
 
-def is_valid_message(message: Any, accepts: Callable[[str, Any], bool]) -> bool:
-    """Whether the viewer's own page could have sent this decoded message: one of `KINDS`, or a value of a control.
-
-    Args:
-        accepts: whether the control with this id can have this value.
-    """
+def is_valid_message(message: Any, accepts: Accepts) -> bool:
+    """Whether the viewer's own page could have sent this decoded message: one of `KINDS`, or a value of a control."""
     if not isinstance(message, dict):
         return False
     if message.get("type") == "GuiUpdateMessage":
-        updates = message.get("updates")
-        # viser would set any other attribute too, such as callbacks or visibility.
-        named = isinstance(updates, dict) and updates.keys() == {"value"}
-        return named and accepts(str(message.get("uuid")), updates["value"])
+        match message.get("updates"):
+            case {"value": value, **others} if not others:  # viser would set any other attribute too: callbacks ...
+                return accepts(str(message.get("uuid")), value)
+        return False
     rules = ((rule, message[name]) for name, rule in FIELDS.items() if name in message)
     return message.get("type") in KINDS and all(rule(value) for rule, value in rules)

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from ..core.types import Camera
 from .layers import Lines, draw_lines
-from .viewable import IDLE_SECONDS, Viewable, ViewSettings, shrink_factor
+from .viewable import IDLE_SECONDS, ViewSettings, shrink_factor
 from .viewport import Viewport, bounded_aspect, endoscope_viewport, free_viewport
 
 if TYPE_CHECKING:
     import viser
+
+    from .viewable import Viewable
 
 PREVIEW_QUALITY = 80
 """JPEG quality of images while something moves; static images are PNG (lossless)."""
@@ -24,8 +26,6 @@ SPLATS_NODE, POINTS_NODE, LINES_NODE = "/splats", "/points", "/lines"
 
 @dataclass
 class _Browser:
-    """State of one connected browser."""
-
     client: viser.ClientHandle
     pose: tuple | None = None
     """Endoscope pose and field of view that its camera was set to."""
@@ -43,11 +43,9 @@ class Browsers:
         self._full_ms = 0.0
 
     def join(self, client: viser.ClientHandle) -> None:
-        """Add a browser that connected."""
         self._browsers[client.client_id] = _Browser(client)
 
     def leave(self, client: viser.ClientHandle) -> None:
-        """Remove a browser that disconnected."""
         self._browsers.pop(client.client_id, None)
 
     def notify(self, title: str, body: str) -> None:
@@ -58,7 +56,7 @@ class Browsers:
     def _connected(self) -> list[_Browser]:
         """Browsers that are still connected; `leave` may not have been called yet."""
         clients = self._server.get_clients()
-        return [browser for number, browser in list(self._browsers.items()) if number in clients]
+        return [browser for number, browser in self._browsers.items() if number in clients]
 
     def return_to_endoscope(self) -> None:
         """Reset the camera of every browser to the endoscope at the next update."""
@@ -77,16 +75,6 @@ class Browsers:
                 camera.position, camera.look_at = places
                 camera.up_direction = move[:3, :3] @ camera.up_direction
 
-    def viewport(
-        self, client: viser.ClientHandle, viewable: Viewable, settings: ViewSettings, shrink: int = 1
-    ) -> Viewport | None:
-        """The current viewport of a browser; None if its camera is invalid."""
-        camera, own = client.camera, viewable.cameras[settings.frame]
-        aspect = bounded_aspect(camera.image_width, camera.image_height)
-        if settings.endoscope:
-            return endoscope_viewport(own, aspect, shrink)
-        return free_viewport(camera.wxyz, camera.position, camera.fov, aspect, own.height, shrink)
-
     def draw(self, viewable: Viewable, version: int, settings: ViewSettings, lines: Lines, idle_seconds: float) -> None:
         """Update every browser.
 
@@ -94,81 +82,79 @@ class Browsers:
             version: changes when the content of `viewable` changes.
             idle_seconds: time since the last motion.
         """
+        content = version, settings, lines.segments.tobytes()
         sent = viewable.renders_in_browser(settings)
-        self._send_nodes(viewable, version, settings, lines, sent)
+        if self._sent != (content if sent else None):
+            self._sent = content if sent else None
+            self._send_nodes(viewable, settings, lines, sent)
+        shrink, preview = shrink_factor(idle_seconds, self._full_ms), idle_seconds < IDLE_SECONDS
         for browser in self._connected():
+            client = browser.client
             if settings.endoscope:
-                self._follow_endoscope(browser, viewable, settings)
-            if not sent:
-                self._send_picture(browser, viewable, version, settings, lines, idle_seconds)
-            elif browser.shown is not None:
-                browser.client.scene.set_background_image(None)
-                browser.shown = None
+                _follow_endoscope(browser, viewable, settings)
+            if sent:
+                if browser.shown is not None:
+                    client.scene.set_background_image(None)
+                    browser.shown = None
+                continue
+            viewport = viewport_of(client, viewable, settings, shrink)
+            if viewport is None:
+                continue
+            camera, shown = viewport.camera, browser.shown
+            wanted = content, camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), viewport.width
+            # After a preview, send the full image once nothing moves.
+            if shown is not None and shown[0] == wanted and (preview or not shown[1]):
+                continue
+            began = clock.perf_counter()
+            picture = viewport.paste(picture_with_lines(viewable, settings, camera, lines))
+            if shrink == 1:
+                self._full_ms = 1e3 * (clock.perf_counter() - began)
+            client.scene.set_background_image(picture, "jpeg" if preview else "png", jpeg_quality=PREVIEW_QUALITY)
+            client.flush()
+            browser.shown = wanted, preview
 
-    def _send_picture(
-        self,
-        browser: _Browser,
-        viewable: Viewable,
-        version: int,
-        settings: ViewSettings,
-        lines: Lines,
-        idle_seconds: float,
-    ) -> None:
-        shrink = shrink_factor(idle_seconds, self._full_ms)
-        viewport = self.viewport(browser.client, viewable, settings, shrink)
-        if viewport is None:
-            return
-        camera, preview = viewport.camera, idle_seconds < IDLE_SECONDS
-        seen_from = camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), viewport.width
-        wanted = version, settings, seen_from, lines.segments.tobytes()
-        # After a preview, send the full image once nothing moves.
-        if browser.shown is not None and browser.shown[0] == wanted and (preview or not browser.shown[1]):
-            return
-        began = clock.perf_counter()
-        picture = picture_with_lines(viewable, settings, camera, lines)
-        if shrink == 1:
-            self._full_ms = 1e3 * (clock.perf_counter() - began)
-        scene = browser.client.scene
-        scene.set_background_image(viewport.paste(picture), "jpeg" if preview else "png", jpeg_quality=PREVIEW_QUALITY)
-        browser.client.flush()
-        browser.shown = wanted, preview
-
-    def _send_nodes(self, viewable: Viewable, version: int, settings: ViewSettings, lines: Lines, sent: bool) -> None:
+    def _send_nodes(self, viewable: Viewable, settings: ViewSettings, lines: Lines, sent: bool) -> None:
         """Update the objects that browsers render themselves: nothing, or a cloud and the lines."""
-        wanted = (version, settings, lines.segments.tobytes()) if sent else None
-        if wanted == self._sent:
-            return
-        self._sent, scene = wanted, self._server.scene
+        scene = self._server.scene
         with self._server.atomic():
             cloud = viewable.cloud(settings) if sent else None
             splats = cloud is not None and cloud.covariances is not None
-            for name, gone in (
-                (SPLATS_NODE, not splats),
-                (POINTS_NODE, cloud is None or splats),
-                (LINES_NODE, cloud is None or not len(lines)),
-            ):
-                if gone and scene.get_handle_by_name(name) is not None:
+            shown = {SPLATS_NODE: splats, POINTS_NODE: sent and not splats, LINES_NODE: sent and len(lines) > 0}
+            for name in shown:
+                if not shown[name] and scene.get_handle_by_name(name) is not None:
                     scene.remove_by_name(name)
             if cloud is None:
                 return
-            if splats:
+            if cloud.covariances is not None:
                 colors, opacities = cloud.colors / 255.0, cloud.opacities[:, None]
                 scene.add_gaussian_splats(SPLATS_NODE, cloud.points, cloud.covariances, colors, opacities)
             else:
-                look_of_points = {"point_size": cloud.size, "point_shape": "circle", "precision": "float32"}
-                scene.add_point_cloud(POINTS_NODE, cloud.points, cloud.colors, **look_of_points)
+                look = {"point_size": cloud.size, "point_shape": "circle", "precision": "float32"}
+                scene.add_point_cloud(POINTS_NODE, cloud.points, cloud.colors, **look)
             if len(lines):
                 colors = np.repeat(lines.colors[:, None], 2, 1)
                 scene.add_line_segments(LINES_NODE, lines.segments, colors, thickness=3.0, thickness_units="screen")
 
-    def _follow_endoscope(self, browser: _Browser, viewable: Viewable, settings: ViewSettings) -> None:
-        """Set the browser's camera to the endoscope camera."""
-        viewport = self.viewport(browser.client, viewable, settings)
-        pose = viewport.camera.world_to_camera.tobytes(), round(viewport.fov, 4)
-        if browser.pose == pose:
-            return
+
+def viewport_of(
+    client: viser.ClientHandle, viewable: Viewable, settings: ViewSettings, shrink: int = 1
+) -> Viewport | None:
+    """The current viewport of a browser; None if its camera is invalid."""
+    camera, own = client.camera, viewable.cameras[settings.frame]
+    aspect = bounded_aspect(camera.image_width, camera.image_height)
+    if settings.endoscope:
+        return endoscope_viewport(own, aspect, shrink)
+    return free_viewport(camera.wxyz, camera.position, camera.fov, aspect, own.height, shrink)
+
+
+def _follow_endoscope(browser: _Browser, viewable: Viewable, settings: ViewSettings) -> None:
+    """Set the browser's camera to the endoscope camera."""
+    camera = browser.client.camera
+    aspect = bounded_aspect(camera.image_width, camera.image_height)
+    viewport = endoscope_viewport(viewable.cameras[settings.frame], aspect)
+    pose = viewport.camera.world_to_camera.tobytes(), round(viewport.fov, 4)
+    if browser.pose != pose:
         browser.pose = pose
-        camera = browser.client.camera
         with browser.client.atomic():
             camera.position, camera.look_at, camera.up_direction = camera_pose(viewport.camera, viewable)
             camera.fov = viewport.fov

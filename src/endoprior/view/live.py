@@ -9,13 +9,13 @@ from __future__ import annotations
 import time as clock
 from typing import TYPE_CHECKING
 
+from ..model.scene import Scene
 from ..system.console import say
 from .server import Viewer
 from .viewable_scene import ViewableScene
 
 if TYPE_CHECKING:
-    from ..training.stage import StepReport
-    from ..training.trainer import Trainer
+    from ..training.trainer import StepReport, Trainer
 
 REFRESH_SECONDS = 2.0
 """Least time between two displayed states."""
@@ -24,38 +24,34 @@ LARGEST_SHARE = 0.2
 
 
 class LiveView:
-    """An `on_step` callback of `runs.training_run.train` that updates a viewer."""
+    """An `on_step` callback of `runs.train.train` that updates a viewer at `host` and `port`."""
 
     def __init__(self, host: str, port: int) -> None:
-        """The server starts after the first iteration.
-
-        Args:
-            host, port: see `Viewer`.
-        """
         self.host, self.port = host, port
-        self.viewer: Viewer | None = None
+        self.viewer: Viewer | None = None  # it starts after the first iteration
         self._due = 0.0
 
     def __call__(self, report: StepReport, trainer: Trainer) -> None:
         """After an iteration: handle user input, and from time to time show the new state."""
         if self.viewer is None:
-            self.viewer = Viewer(self._subject(report, trainer), host=self.host, port=self.port)
+            self.viewer = Viewer(_subject(report, trainer), host=self.host, port=self.port)
             say(f"view: {self.viewer.url}")
         began = clock.monotonic()
-        if began >= self._due and self.viewer.watched:
-            self.viewer.show(self._subject(report, trainer))
-            self.viewer.work()
-            took = clock.monotonic() - began
-            self._due = clock.monotonic() + max(REFRESH_SECONDS, took / LARGEST_SHARE)
-        else:
-            self.viewer.work()
+        refreshes = began >= self._due and self.viewer.watched
+        if refreshes:
+            self.viewer.show(_subject(report, trainer))
+        self.viewer.work()
+        if refreshes:
+            now = clock.monotonic()
+            self._due = now + max(REFRESH_SECONDS, (now - began) / LARGEST_SHARE)
 
     def close(self) -> None:
-        """Stop listening."""
         if self.viewer is not None:
             self.viewer.close()
 
-    @staticmethod
-    def _subject(report: StepReport, trainer: Trainer) -> ViewableScene:
-        title = f"{report.stage.name.lower()}, iteration {report.iteration}, {report.num_gaussians} Gaussians"
-        return ViewableScene(trainer.scene(), title, trainer.sequence)
+
+def _subject(report: StepReport, trainer: Trainer) -> ViewableScene:
+    title = f"{report.stage.name.lower()}, iteration {report.iteration}, {report.num_gaussians} Gaussians"
+    scene = trainer.scene()
+    assert isinstance(scene, Scene), "`train --view` takes methods of Gaussians only"
+    return ViewableScene(scene, title, trainer.sequence)

@@ -1,4 +1,4 @@
-"""The brush: pointer and controls of the browsers, applied to `MaskEdits`.
+"""Corrections of tool masks: brush strokes, carrying to other frames, undo, saving; and the brush that makes them.
 
 A browser reports where the pointer is dragged only if it drags an object of the scene. A sphere around everything,
 beyond the farthest distance that browsers render, is such an object: always under the pointer, never visible.
@@ -6,24 +6,145 @@ beyond the farthest distance that browsers render, is such an object: always und
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from ..core.checks import number_ranges
-from ..tool_masks.clicked_tools import SearchStep, ToolClick
-from .access_control import BRUSH_NODE
-from .job_queue import JobQueue
-from .mask_edits import MaskEdits, Masks, carried_text
+from ..data import FrameSequence
+from ..data.folder_edits import replace_masks
+from ..data.found_tools import drop_rows
+from ..footage.carry_masks import CarriedEdit, carry_mask_edit
+from ..tool_masks.clicked_tools import SearchStep, ToolClick, find_clicked
+from .access_control import BRUSH_NODE, JobQueue
 
 if TYPE_CHECKING:
     import viser
 
     from .panel import Panel
 
+MOST_UNDO = 100
+"""Number of steps that can be undone."""
+Mask = NDArray[np.bool_]
+"""(H, W) True on tools."""
+Masks = dict[int, Mask]
+"""By frame. A mask is never changed, only replaced."""
+
+
+class _State(NamedTuple):
+    masks: Masks
+    """Masks that were corrected."""
+    uncarried: Masks
+    """The masks before the strokes that were not carried yet."""
+
+
+class MaskEdits:
+    """Corrected masks of one sequence. Nothing is written before `save`."""
+
+    def __init__(self, sequence: FrameSequence) -> None:
+        self._sequence = sequence
+        self._state, self._undo = _State({}, {}), list[_State]()
+        self._saved: Masks = {}
+        """Masks of files that differ from what `sequence` has read."""
+
+    def tool(self, frame: int) -> Mask:
+        """The mask of a frame, with its corrections."""
+        found = self._state.masks.get(frame)
+        return ~self._sequence.frame(frame).tissue_mask if found is None else found
+
+    @property
+    def unsaved(self) -> list[int]:
+        """The frames whose mask was changed since it was read or saved."""
+        current = self._state.masks
+        return sorted(i for i in {*current, *self._saved} if current.get(i) is not self._saved.get(i))
+
+    def begin(self) -> None:
+        """Begin a stroke: `undo` goes back to here."""
+        self._undo = [*self._undo, self._state][-MOST_UNDO:]
+
+    def draw(self, frame: int, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> None:
+        """Continue the stroke through points (x, y), px of the mask, as `stroke`."""
+        before = self.tool(frame)
+        masks = {**self._state.masks, frame: stroke(before, points, radius, paint)}
+        self._state = _State(masks, {frame: before, **self._state.uncarried})
+
+    def carry(self, frame: int) -> CarriedEdit:
+        """Carry what was corrected in a frame since the last time to the frames around it."""
+        edited = self.tool(frame)
+        before = self._state.uncarried.get(frame, edited)
+        done = carry_mask_edit(
+            lambda i: self._sequence.frame(i).rgb_u8,
+            lambda i: before if i == frame else self.tool(i),
+            len(self._sequence),
+            frame,
+            edited,
+        )
+        if done.masks:
+            self.begin()
+            uncarried = {i: mask for i, mask in self._state.uncarried.items() if i != frame}
+            self._state = _State(self._state.masks | done.masks, uncarried)
+        return done
+
+    def find(self, click: ToolClick) -> Iterator[SearchStep]:
+        """Search every frame for the tool at a click that the masks miss; give what is found to `add`.
+
+        Raises:
+            InputError: the click is not in the image, or on a mask.
+        """
+        return find_clicked(self._sequence, [click], self.tool)
+
+    def add(self, added: Masks) -> None:
+        """Add pixels to the masks of some frames, as one step. Strokes that were not carried yet stay so."""
+        self.begin()
+        masks = self._state.masks | {i: self.tool(i) | mask for i, mask in added.items()}
+        self._state = self._state._replace(masks=masks)
+
+    def undo(self) -> bool:
+        """Go back by one stroke, one carrying or one search; False if there is none."""
+        if not self._undo:
+            return False
+        *self._undo, self._state = self._undo
+        return True
+
+    def save(self) -> list[int]:
+        """Write every changed mask to its file, keep the original once, and note what changed. Returns the frames.
+
+        Their confidence in `tool_masks.json` is removed: a person has looked at them.
+
+        Raises:
+            InputError: the folder is read-only, or the disk rejects a file; masks written before it stay written.
+        """
+        if frames := self.unsaved:
+            replace_masks(self._sequence, {frame: self.tool(frame) for frame in frames})
+            drop_rows(self._sequence.path, frames)
+            self._saved = dict(self._state.masks)
+        return frames
+
+
+def stroke(mask: Mask, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> Mask:
+    """A copy of a mask with a brush stroke.
+
+    Args:
+        points: (x, y) through which the center of the brush moves, px; (0, 0) is the upper left corner of the image.
+        radius: of the brush, px; at least one pixel is changed.
+        paint: True adds pixels, False removes them.
+    """
+    drawn = np.zeros(mask.shape, np.uint8)
+    # Sixteenths of a pixel; OpenCV counts pixel centers from 0. Positions far outside would overflow.
+    limit = 4 * max(mask.shape)
+    fixed = np.rint(16 * (np.clip(points, -limit, limit) - 0.5)).astype(np.int32)
+    cv2.polylines(drawn, [fixed], False, 1, max(round(2 * radius), 1), cv2.LINE_8, 4)
+    for point in fixed.tolist():
+        cv2.circle(drawn, point, round(16 * radius), 1, -1, cv2.LINE_8, 4)
+    return mask | (drawn > 0) if paint else mask & (drawn == 0)
+
+
 SPHERE_MM = 5000.0
 """Radius of the sphere; browsers render up to 1000."""
-ERASING_KEY = "shift"
+ERASING_KEY: Final = "shift"
 
 Spot = tuple[int, tuple[float, float]]
 """A frame, and a position in its mask, px."""
@@ -52,7 +173,7 @@ class MaskEditor:
         self._last: dict[int, Spot] = {}
         """Where each browser's stroke is."""
         self._listens = False
-        self._search: _Search | None = None
+        self._search: Iterator[SearchStep] | None = None
         self._say("")
 
     def listen(self, active: bool) -> None:
@@ -63,15 +184,14 @@ class MaskEditor:
         self._last.clear()
         if not active:
             self._scene.remove_click_callback(self._on_click)
-            self._scene.remove_click_callback(self._on_erasing_click)
             self._scene.remove_by_name(BRUSH_NODE)
             return
         sphere = self._scene.add_icosphere(
             BRUSH_NODE, SPHERE_MM, subdivisions=1, side="double", cast_shadow=False, receive_shadow=False
         )
-        for key, clicked in ((None, self._on_click), (ERASING_KEY, self._on_erasing_click)):
+        for key in (None, ERASING_KEY):
             sphere.on_drag("left", modifier=key)(self._on_drag)
-            self._scene.on_click(modifier=key)(clicked)
+            cast("Any", self._scene.on_click(modifier=key))(self._on_click)  # its types know no asynchronous ones
 
     # Callbacks in viser's threads. Asynchronous ones are called in order.
 
@@ -79,35 +199,32 @@ class MaskEditor:
         self._jobs.put(lambda: self._drag(event))
 
     async def _on_click(self, event: viser.SceneClickEvent) -> None:
-        self._jobs.put(lambda: self._dab(event, False))
-
-    async def _on_erasing_click(self, event: viser.SceneClickEvent) -> None:
-        self._jobs.put(lambda: self._dab(event, True))
+        self._jobs.put(lambda: self._dab(event))
 
     def _drag(self, event: viser.SceneNodeDragEvent) -> None:
         """Continue a stroke; begin it if it is new. It stays in the frame in which it began."""
-        here = self._spot(event.client, event.end_screen_pos)
+        browser, here = event.client_id, self._spot(event.client, event.end_screen_pos)
         if event.phase == "start":
-            self._last.pop(event.client_id, None)
+            self._last.pop(browser, None)
             if (began := self._spot(event.client, event.start_screen_pos)) is not None and self._listens:
                 self.edits.begin()
-                self._last[event.client_id] = began
-        if here is None or (last := self._last.get(event.client_id)) is None:
+                self._last[browser] = began
+        if here is None or (last := self._last.get(browser)) is None:
             return
         frame, before = last
         self._draw(frame, [before, here[1]], event.modifier == ERASING_KEY)
-        self._last[event.client_id] = frame, here[1]
+        self._last[browser] = frame, here[1]
         if event.phase == "end":
-            del self._last[event.client_id]
+            del self._last[browser]
 
-    def _dab(self, event: viser.SceneClickEvent, erasing_key: bool) -> None:
+    def _dab(self, event: viser.SceneClickEvent) -> None:
         """A stroke of one point, or a search for the tool there."""
         if self._listens and (here := self._spot(event.client, event.screen_pos)) is not None:
             if self._controls.find.value:
                 self.find(*here)
                 return
             self.edits.begin()
-            self._draw(here[0], [here[1]], erasing_key)
+            self._draw(here[0], [here[1]], event.modifier == ERASING_KEY)
 
     def _draw(self, frame: int, points: list[tuple[float, float]], erasing_key: bool) -> None:
         paint = self._controls.erase.value == erasing_key  # the key reverses the control
@@ -122,29 +239,29 @@ class MaskEditor:
         Raises:
             InputError: that place is masked already.
         """
-        self._search = _Search(self.edits.find(ToolClick(frame, *place)))
-        self._continue(self._search)
+        self._search = search = self.edits.find(ToolClick(frame, *place))
+        self._continue(search, {})
 
-    def _continue(self, search: _Search) -> None:
-        """Search one more frame, unless the search was stopped; when all are, add what was found."""
+    def _continue(self, search: Iterator[SearchStep], added: Masks) -> None:
+        """Search one more frame, unless the search was stopped; when all are, add what was found in them."""
         if search is not self._search:
             return
         try:
-            step = next(search.steps, None)
+            step = next(search, None)
         except Exception:  # shown by the viewer; the search is over
             self._search = None
             self._say("")
             raise
         if step is not None:
-            if step.added is not None and step.added.any():
-                search.added[step.frame] = step.added
+            if step.frame is not None and step.added is not None and step.added.any():
+                added[step.frame] = step.added
             self._controls.corrected.content = f"Finding the tool: {step.done} of {step.total}. *Undo* stops."
-            self._jobs.put(lambda: self._continue(search), surely=True)
+            self._jobs.put(lambda: self._continue(search, added), surely=True)
             return
         self._search = None
-        if search.added:
-            self.edits.add(search.added)
-        self._say(f"Found in {_frames(sorted(search.added))}." if search.added else "Nothing was found.")
+        if added:
+            self.edits.add(added)
+        self._say(f"Found in {_frames(sorted(added))}." if added else "Nothing was found.")
 
     # Buttons.
 
@@ -153,40 +270,27 @@ class MaskEditor:
         if self._search is not None:
             self._search = None
             self._say("Stopped.")
-            return
-        self._say("" if self.edits.undo() else "Nothing to undo.")
+        else:
+            self._say("" if self.edits.undo() else "Nothing to undo.")
 
     def carry(self, frame: int) -> None:
-        """Carry the correction of a frame to those around it."""
+        """Carry the correction of a frame to those around it, and say what changed and why it stopped."""
         self._controls.corrected.content = "Carrying the correction..."
-        self._say(carried_text(self.edits.carry(frame)))
+        done = self.edits.carry(frame)
+        changed = f"Changed frames: {number_ranges(done.masks)}." if done.masks else "No frame changed."
+        self._say(f"{changed}  \nBackward until {done.before}.  \nForward until {done.after}.")
 
     def save(self) -> None:
-        """Write the changed masks.
-
-        Raises:
-            InputError: they cannot be written.
-        """
+        """Write the changed masks; raises InputError if they cannot be written."""
         frames = self.edits.save()
         self._say(f"Saved: {_frames(frames)}." if frames else "Nothing to save.")
 
     def _say(self, text: str) -> None:
         """Show a text and which masks are not saved."""
         unsaved = self.edits.unsaved
-        lines = [text] if text else []
-        if unsaved:
-            lines.append(f"Not saved: {_frames(unsaved)}.")
-        self._controls.corrected.content = "  \n".join(lines)
+        lines = [text, f"Not saved: {_frames(unsaved)}." if unsaved else ""]
+        self._controls.corrected.content = "  \n".join(filter(None, lines))
         self._changed()
-
-
-@dataclass(frozen=True)
-class _Search:
-    """A search for a clicked tool."""
-
-    steps: Iterator[SearchStep]
-    added: Masks = field(default_factory=dict)
-    """(H, W) by frame, of what was found so far."""
 
 
 def _frames(numbers: list[int]) -> str:

@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import uplot
 
 from ..core.geometry import length_unit
 from .access_control import are_numbers
-from .viewable import Layer, Viewable, ViewSettings
+from .viewable import Layer, ViewSettings
 
 if TYPE_CHECKING:
     import viser
+
+    from .viewable import Viewable
 
 LAYER_NAMES: dict[Layer, str] = {
     "color": "Color",
@@ -30,16 +33,10 @@ LAYER_NAMES: dict[Layer, str] = {
 ENDOSCOPE, ORBIT = "Endoscope", "Orbit"
 SERVER, BROWSER = "Server (exact)", "Browser (smooth)"
 SPLATS, POINTS = "Splats", "Points"
-ORIGINALS = ("frame", "difference")
 DISTANCE, AREA, PATH, DISPLACEMENT, STRETCH = "Distance", "Area", "Path length", "Displacement", "Stretch"
-POINTS_OF = {DISTANCE: 2, AREA: 64, PATH: 1, DISPLACEMENT: 1, STRETCH: 1}
-"""Quantities to measure, and the most points of each: the next click after that begins a new measurement."""
+POINTS_OF = {DISTANCE: (2, 2), AREA: (3, 64), PATH: (1, 1), DISPLACEMENT: (1, 1), STRETCH: (1, 1)}
+"""Quantities to measure, with the fewest and most points of each: the next click begins a new measurement."""
 SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
-CHOICES = ("speed", "layer", "camera", "rendered_by", "rendered_as", "quantity")
-SWITCHES = ("tool", "riding", "tracks", "follow", "measure", "correct", "erase", "find")
-SWITCHES += ("play", "clear", "table", "screenshot", "keep", "forget", "video", "undo", "carry", "save_masks")
-SWITCHES += ("clear_tracks",)
-"""Names of the controls of a `Panel` that a browser sets to one of several texts, and to True or False."""
 CLIP_MARGIN = 1.5
 """The clipping slider ends at this multiple of the far depth; at its end nothing is clipped."""
 
@@ -52,8 +49,8 @@ def control_id(handle: Any) -> str:
 class Panel:
     """All controls, by name."""
 
-    def __init__(self, gui: viser.GuiApi, viewable: Viewable, uplot: Any) -> None:
-        """Build the controls that `viewable` supports. `uplot` is viser's module of chart types."""
+    def __init__(self, gui: viser.GuiApi, viewable: Viewable) -> None:
+        """Build the controls that `viewable` supports."""
         total, trained = len(viewable.cameras), "color" in viewable.layers
         self._total = total
         self.status = gui.add_markdown("")
@@ -61,24 +58,21 @@ class Panel:
         self.play = gui.add_button("Play", disabled=total < 2)
         self.speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
         with gui.add_folder("Show"):
-            names = [LAYER_NAMES[layer] for layer in viewable.layers]
-            self.layer = gui.add_dropdown("Layer", names, initial_value=names[0])
-            self.camera = gui.add_dropdown("Camera", (ENDOSCOPE, ORBIT), initial_value=ENDOSCOPE)
+            self.layer = gui.add_dropdown("Layer", [LAYER_NAMES[layer] for layer in viewable.layers])
+            self.camera = gui.add_dropdown("Camera", (ENDOSCOPE, ORBIT))
             moves = bool(np.ptp([camera.world_to_camera for camera in viewable.cameras], axis=0).any())
             hint = "The view of Orbit keeps its place beside the endoscope."
             self.riding = gui.add_checkbox("Move with the endoscope", True, visible=moves, hint=hint)
-            self.rendered_by = gui.add_dropdown("Rendered by", (SERVER, BROWSER), initial_value=SERVER, visible=trained)
-            self.rendered_as = gui.add_dropdown("Rendered as", (SPLATS, POINTS), initial_value=SPLATS, visible=trained)
+            self.rendered_by = gui.add_dropdown("Rendered by", (SERVER, BROWSER), visible=trained)
+            self.rendered_as = gui.add_dropdown("Rendered as", (SPLATS, POINTS), visible=trained)
             hint = "Displacement and stretch are measured since this frame."
             self.since = gui.add_slider("Since frame", 0, max(total - 1, 1), 1, 0, visible=trained, hint=hint)
             self.tool = gui.add_checkbox("Tool overlay", False, visible=viewable.has_tool)
             self.tracks = gui.add_checkbox("Material tracks", False)
             self.clip_end = float(np.ceil(CLIP_MARGIN * viewable.span[1])) or 1.0
-            step = 10.0 ** np.floor(np.log10(self.clip_end / 100))
-            unit = length_unit(viewable.relative)
-            self.clip = gui.add_multi_slider(
-                f"Depth range, {unit}", 0.0, self.clip_end, float(step), (0.0, self.clip_end)
-            )
+            step, unit = 10.0 ** np.floor(np.log10(self.clip_end / 100)), length_unit(viewable.relative)
+            whole = 0.0, self.clip_end
+            self.clip = gui.add_multi_slider(f"Depth range, {unit}", *whole, float(step), whole)
         with gui.add_folder("Correct tool masks", visible=viewable.mask_edits is not None):
             width = viewable.cameras[0].width
             self.correct = gui.add_checkbox("Correct by painting", False)
@@ -95,34 +89,32 @@ class Panel:
             self.clear_tracks = gui.add_button("Clear tracks")
         with gui.add_folder("Measure"):
             self.measure = gui.add_checkbox("Measure by clicking", False)
-            self.quantity = gui.add_dropdown("Quantity", tuple(POINTS_OF), initial_value=DISTANCE, visible=trained)
+            self.quantity = gui.add_dropdown("Quantity", tuple(POINTS_OF), visible=trained)
             self.clear = gui.add_button("Clear measurement")
             self.table = gui.add_button("Save table (CSV)", hint="Every quantity of the points, in all frames.")
             self.distance = gui.add_markdown("")
-            axis = np.arange(total, dtype=np.float64)
             series = (uplot.Series(label="frame"), uplot.Series(label="measured", stroke="orange", width=2))
-            scales = {"x": uplot.Scale(time=False)}
-            self.chart = gui.add_uplot((axis, np.zeros(total)), series, scales=scales, height=160, visible=False)
+            scales, empty = {"x": uplot.Scale(time=False)}, (np.arange(float(total)), np.zeros(total))
+            self.chart = gui.add_uplot(empty, series, scales=scales, height=160, visible=False)
         with gui.add_folder("Save"):
             self.screenshot = gui.add_button("Screenshot (PNG)")
             self.keep = gui.add_button("Save this view", hint="The video interpolates between saved views, in order.")
             self.forget = gui.add_button("Delete saved views")
             self.video = gui.add_button("Video (MP4)", hint="All frames from this view, or through the saved views.")
-        names = "frame", "since", "clip", "radius", *CHOICES, *SWITCHES
-        self._names = {control_id(getattr(self, name)): name for name in names}
+        self._controls = {control_id(h): (name, h) for name, h in vars(self).items() if hasattr(h, "value")}
 
     def accepts(self, uuid: str, value: Any) -> bool:
         """Whether the control with this id can have this value; False if there is no such control."""
-        name = self._names.get(uuid)
-        if name in ("frame", "since"):
-            return are_numbers([value], 1, self.frame.max) and value >= 0
+        name, control = self._controls.get(uuid, ("", None))
+        if control is None:
+            return False
         if name == "clip":
             return are_numbers(value, 2, self.clip_end) and min(value) >= 0
-        if name == "radius":
-            return are_numbers([value], 1, self.radius.max) and value >= self.radius.min
-        if name in CHOICES:
-            return isinstance(value, str) and value in getattr(self, name).options
-        return name in SWITCHES and isinstance(value, bool)
+        if hasattr(control, "max"):
+            return are_numbers([value], 1, control.max) and value >= control.min
+        if hasattr(control, "options"):
+            return isinstance(value, str) and value in control.options
+        return isinstance(value, bool)
 
     def set_length(self, total: int, settings: ViewSettings) -> None:
         """Offer this number of frames, and show the two of `settings`."""
@@ -140,7 +132,7 @@ class Panel:
         """Show a quantity over the frames (T,), or hide the chart if it is known in fewer than two."""
         self.chart.visible = bool(np.isfinite(values).sum() > 1)
         if self.chart.visible:
-            self.chart.data = np.arange(len(values), dtype=np.float64), values
+            self.chart.data = np.arange(float(len(values))), values
 
     def chosen(self, settings: ViewSettings) -> ViewSettings:
         """`settings` updated with the current values of the controls under Show."""
@@ -175,7 +167,7 @@ def status(viewable: Viewable, settings: ViewSettings, num_kept: int) -> str:
         lines.append(legend)
     if settings.in_browser and not viewable.renders_in_browser(settings):
         lines.append("This layer is rendered by the server.")
-    if not settings.endoscope and settings.layer in ORIGINALS and "color" in viewable.layers:
+    if not settings.endoscope and settings.layer in ("frame", "difference") and "color" in viewable.layers:
         lines.append("Input frames are available in the endoscope view only; showing color.")
     if settings.correcting and not settings.endoscope:
         lines.append("Tool masks are corrected in the endoscope view.")

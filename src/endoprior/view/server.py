@@ -1,4 +1,4 @@
-"""The viewer server. The only module that imports viser.
+"""The viewer server.
 
 Callbacks of controls and cameras run in viser's threads; they only add jobs to a queue. The thread that calls `work` (a
 loop, or a training run between two iterations) runs the jobs and renders. Rendering therefore has a single thread.
@@ -11,42 +11,50 @@ import io
 import ipaddress
 import secrets
 import sys
+import tempfile
 import time as clock
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
+from typing_extensions import override
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.types import Camera
 from ..data.images import encode_png
+from ..system.atomic import whole_file
 from ..system.console import complain
+from ..visualization.video import write_video
 from . import panel
-from .access_control import RateLimit, access_control, check_address
-from .browsers import Browsers, camera_pose, picture_with_lines
-from .job_queue import JobQueue
-from .layers import Lines, concatenated
+from .access_control import Job, JobQueue, RateLimit, access_control, check_address
+from .browsers import Browsers, camera_pose, picture_with_lines, viewport_of
+from .layers import Lines
 from .mask_editor import MaskEditor, Spot
-from .measure import DrawnTracks, Measurement, Measuring, pick
-from .saving import PathPoint, follow_frames, interpolate, keep, mp4_bytes
-from .viewable import IDLE_SECONDS, Viewable, ViewSettings, frame_due
-from .viewport import endoscope_viewport
+from .measure import DrawnTracks, Measuring, pick
+from .viewable import IDLE_SECONDS, ViewSettings, frame_due
+from .viewport import PathPoint, Viewport, endoscope_viewport, follow_frames, interpolate
+
+if TYPE_CHECKING:
+    from .viewable import Viewable
 
 MAX_KEPT = 100
 """Largest number of saved views."""
 MAX_PICTURES = 10_000
 """Largest number of images of a video."""
+ClientJob = Callable[[viser.ClientHandle], object]
 
 
 class _LocalServer(viser.ViserServer):
     """A server that never publishes the scene; viser lets any client request a public URL."""
 
+    @override
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
 
@@ -67,10 +75,9 @@ class Viewer:
         check_address(host, port)
         warnings.filterwarnings("ignore", "Queued a", UserWarning)  # from viser, when a browser disconnects
         self.viewable, self.settings, self.out, self.host = viewable, ViewSettings(layer=viewable.layers[0]), out, host
-        self.jobs = JobQueue()
-        self._playing: tuple[int, float] | None = None  # frame and time at the start of playback
-        self.tracks = DrawnTracks(viewable)
+        self.jobs, self.tracks = JobQueue(), DrawnTracks(viewable)
         self.kept_views: list[PathPoint] = []
+        self._playing: tuple[int, float] | None = None  # frame and time at the start of playback
         self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
         self._token = secrets.token_urlsafe(24)
         with contextlib.redirect_stdout(io.StringIO()), access_control(self._token, host, self._accepts):
@@ -82,8 +89,8 @@ class Viewer:
         start.position, start.look_at, start.up = camera_pose(viewable.cameras[0], viewable)
         start.fov = endoscope_viewport(viewable.cameras[0], 1.0).fov
         self._browsers = Browsers(self.server)
-        self.panel = panel.Panel(self.server.gui, viewable, viser.uplot)
-        self._measuring = Measuring(self.panel)
+        self.panel = panel.Panel(self.server.gui, viewable)
+        self.measuring = Measuring(self.panel)
         edits = viewable.mask_edits
         self._editor = edits and MaskEditor(
             edits, self.panel, self.server.scene, self.jobs, self._mask_spot, self._masks_changed
@@ -93,7 +100,6 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
         return self.server.get_port()
 
     @property
@@ -105,11 +111,6 @@ class Viewer:
             if address.is_unspecified:
                 host = "127.0.0.1" if address.version == 4 else "::1"
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}/"
-
-    @property
-    def measured(self) -> Measurement | None:
-        """What is measured of the points that were clicked."""
-        return self._measuring.measured
 
     @property
     def watched(self) -> bool:
@@ -128,7 +129,8 @@ class Viewer:
             self._restart_clock()
         self.viewable, self.tracks = viewable, DrawnTracks(viewable)
         self._version += 1
-        self._clear_measurement()
+        self.measuring.clear()
+        self._update_panel()
 
     def run(self) -> None:
         """Call `work` until interrupted."""
@@ -139,81 +141,66 @@ class Viewer:
             self.close()
 
     def close(self) -> None:
-        """Stop listening."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def work(self, wait: float = 0.0) -> None:
-        """Run waiting jobs, advance playback, render what changed.
-
-        Args:
-            wait: longest time to wait for a job, s.
-        """
-        wait = min(wait, self._seconds_to_next())
-        for job in self.jobs.take(wait):
-            self._attempt(job)
-        self._attempt(self._advance)
-        self._attempt(self._draw)
-
-    def _seconds_to_next(self) -> float:
-        """Time until the next frame of the playback, or until the full-size image after a motion."""
-        if self._playing:
-            return 0.01
+        """Run waiting jobs, advance playback, render what changed; wait at most `wait` s for a job."""
         rest = self._moved_at + IDLE_SECONDS - clock.monotonic()
-        return max(rest, 0.0) + 0.01 if rest > -IDLE_SECONDS else float("inf")
-
-    def _attempt(self, job: Callable[[], None]) -> None:
-        """Run a job. Report a failure on stderr and in the browsers; it stops neither the viewer nor a training."""
-        try:
-            job()
-        except Exception as error:
-            known = isinstance(error, InputError)
-            complain(f"view: {error}") if known else traceback.print_exc(file=sys.stderr)
-            self._browsers.notify("That did not work", str(error) if known else f"{type(error).__name__}: {error}")
+        if self._playing:
+            wait = min(wait, 0.01)
+        elif rest > -IDLE_SECONDS:  # until the image of full size after a motion
+            wait = min(wait, max(rest, 0.0) + 0.01)
+        for job in (*self.jobs.take(wait), self._advance, self._draw):
+            try:
+                job()
+            except Exception as error:  # stops neither the viewer nor a training
+                known = isinstance(error, InputError)
+                complain(f"view: {error}") if known else traceback.print_exc(file=sys.stderr)
+                self._browsers.notify("That did not work", str(error) if known else f"{type(error).__name__}: {error}")
 
     def _accepts(self, uuid: str, value: Any) -> bool:
-        """Whether a control can have this value; there is no panel while the viewer starts."""
-        controls = getattr(self, "panel", None)
-        return controls is not None and controls.accepts(uuid, value)
+        return hasattr(self, "panel") and self.panel.accepts(uuid, value)  # there is no panel while the viewer starts
 
     # Callbacks of the controls.
 
     def _listen(self) -> None:
         controls, ask = self.panel, self.jobs.put
 
-        def on_change(job: Callable[[], None], *handles: viser.GuiInputHandle) -> None:
+        def on_change(job: Job, *handles: Any) -> None:
             for handle in handles:  # values set by the viewer itself arrive without a client
                 handle.on_update(lambda event: ask(job, job) if event.client is not None else None)
 
-        def on_press(
-            handle: viser.GuiButtonHandle, job: Callable[[viser.ClientHandle], object], key: object = None
-        ) -> None:
-            handle.on_click(lambda event: ask(lambda: job(event.client), key) if event.client is not None else None)
+        def on_press(job: ClientJob, handle: viser.GuiButtonHandle, key: object = None) -> None:
+            def pressed(event: viser.GuiEvent) -> None:
+                if (client := event.client) is not None:
+                    ask(lambda: job(client), key)
 
-        def on_save(handle: viser.GuiButtonHandle, job: Callable[[viser.ClientHandle], None]) -> None:
+            handle.on_click(pressed)
+
+        def on_save(job: ClientJob, handle: viser.GuiButtonHandle) -> None:
             """Save at most once per second, and let one press wait: more would fill the disk."""
             rate = RateLimit(1)
-            on_press(handle, lambda client: rate.exceeded(clock.monotonic()) or job(client), job)
+            on_press(lambda client: rate.exceeded(clock.monotonic()) or job(client), handle, job)
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
-        shown = controls.layer, controls.camera, controls.riding, controls.rendered_by, controls.rendered_as
-        on_change(
-            self.read_panel, *shown, controls.tool, controls.tracks, controls.clip, controls.correct, controls.since
-        )
+        on_change(self.read_panel, controls.layer, controls.camera, controls.riding, controls.rendered_by)
+        on_change(self.read_panel, controls.rendered_as, controls.tool, controls.tracks, controls.clip)
+        on_change(self.read_panel, controls.correct, controls.since)
         on_change(self._restart_clock, controls.speed)
         on_change(self.read_clicking, controls.measure, controls.follow, controls.quantity)
-        on_press(controls.play, lambda _: self._toggle_play())
-        on_press(controls.clear, lambda _: self._clear_measurement())
-        on_press(controls.clear_tracks, lambda _: self.tracks.clear())
-        on_save(controls.table, self._save_table)
-        on_press(controls.keep, self._keep_view)
-        on_press(controls.forget, lambda _: self._forget_views())
-        on_save(controls.screenshot, self._screenshot)
-        on_save(controls.video, self._save_video)
+        on_press(lambda _client: self._toggle_play(), controls.play)
+        on_press(lambda _client: self._then_update(self.measuring.clear), controls.clear)
+        on_press(lambda _client: self.tracks.clear(), controls.clear_tracks)
+        on_press(self._keep_view, controls.keep)
+        on_press(lambda _client: self._then_update(self.kept_views.clear), controls.forget)
+        on_save(self._save_table, controls.table)
+        on_save(self._screenshot, controls.screenshot)
+        on_save(self._save_video, controls.video)
         if editor := self._editor:
-            on_press(controls.undo, lambda _: editor.undo())
-            on_press(controls.carry, lambda _: editor.carry(self.settings.frame))
-            on_save(controls.save_masks, lambda _: editor.save())
+            on_press(lambda _client: editor.undo(), controls.undo)
+            on_press(lambda _client: editor.carry(self.settings.frame), controls.carry)
+            on_save(lambda _client: editor.save(), controls.save_masks)
         self.server.on_client_connect(lambda client: ask(lambda: self._welcome(client), surely=True))
         self.server.on_client_disconnect(self._goodbye)
 
@@ -230,29 +217,36 @@ class Viewer:
 
     def read_panel(self) -> None:
         """Update the settings from the controls."""
-        settings = self.panel.chosen(self.settings)
-        if settings.endoscope and not self.settings.endoscope:
+        settings, before = self.panel.chosen(self.settings), self.settings
+        self.settings = settings
+        if settings.endoscope and not before.endoscope:
             self._browsers.return_to_endoscope()
-        moved_reference, self.settings = settings.since != self.settings.since, settings
-        if moved_reference:
-            self._measuring.update(self.viewable, settings)
+        if settings.since != before.since:
+            self.measuring.update(self.viewable, settings)
         if self._editor:
             self._editor.listen(settings.correcting and settings.endoscope)
         self._update_panel()
 
-    def _go_to(self, frame: int) -> None:
-        self._moved_at = clock.monotonic()
-        self._set_frame(min(max(frame, 0), len(self.viewable.cameras) - 1))
-        self._restart_clock()
+    def _then_update(self, job: Job) -> None:
+        job()
         self._update_panel()
 
+    def _update_panel(self) -> None:
+        self.panel.status.content = panel.status(self.viewable, self.settings, len(self.kept_views))
+        self.measuring.show(self.viewable, self.settings.frame)
+
+    # Frames.
+
+    def _go_to(self, frame: int) -> None:
+        self._set_frame(min(max(frame, 0), len(self.viewable.cameras) - 1))
+        self._restart_clock()
+
     def _set_frame(self, frame: int) -> None:
-        """Show a frame; the cameras of browsers ride along with the endoscope, if they are to."""
+        self._moved_at = clock.monotonic()
         if self.settings.riding and not self.settings.endoscope:
             self._browsers.ride(self.viewable.cameras[self.settings.frame], self.viewable.cameras[frame])
         self.settings = replace(self.settings, frame=frame)
-
-    # Playback.
+        self._update_panel()
 
     def _toggle_play(self) -> None:
         self._playing = None if self._playing else (self.settings.frame, clock.monotonic())
@@ -269,24 +263,23 @@ class Viewer:
         rate, total = self.viewable.frames_per_second * self.panel.rate, len(self.viewable.cameras)
         frame = frame_due(start, clock.monotonic() - since, rate, total)
         if frame != self.settings.frame:
-            self._moved_at = clock.monotonic()
             self._set_frame(frame)
             self.panel.frame.value = frame
-            self._update_panel()
-
-    # Rendering.
 
     def _draw(self) -> None:
-        lines = self._lines(self.settings)
-        self._browsers.draw(self.viewable, self._version, self.settings, lines, clock.monotonic() - self._moved_at)
+        lines, idle_seconds = self._lines(self.settings), clock.monotonic() - self._moved_at
+        self._browsers.draw(self.viewable, self._version, self.settings, lines, idle_seconds)
 
     def _lines(self, settings: ViewSettings) -> Lines:
-        return concatenated(self.tracks.lines(settings.frame, settings.tracks), self._measuring.lines(settings.frame))
+        return self.tracks.lines(settings.frame, settings.tracks) + self.measuring.lines(settings.frame)
 
     def _picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
         return picture_with_lines(self.viewable, settings, camera, self._lines(settings))
 
-    # Tracking and measuring.
+    def _viewport(self, client: viser.ClientHandle) -> Viewport | None:
+        return viewport_of(client, self.viewable, self.settings)
+
+    # Clicks: tracks, measures, tool masks.
 
     def read_clicking(self) -> None:
         """Switch clicks on the tissue on or off, and measure what is chosen, as the controls are set."""
@@ -294,7 +287,7 @@ class Viewer:
         scene.remove_click_callback(self._on_click)
         if self.panel.measure.value or self.panel.follow.value:
             scene.on_click()(self._on_click)
-        self._measuring.update(self.viewable, self.settings)
+        self.measuring.update(self.viewable, self.settings)
         self._update_panel()
 
     def _on_click(self, event: viser.SceneClickEvent) -> None:
@@ -302,7 +295,7 @@ class Viewer:
 
     def _pick(self, client: viser.ClientHandle, screen: tuple[float, float]) -> None:
         """Track the point under a click, or measure it."""
-        viewport = self._browsers.viewport(client, self.viewable, self.settings)
+        viewport = self._viewport(client)
         if viewport is None or self.settings.correcting:  # a click paints
             return
         depth = self.viewable.surface(self.settings, viewport.camera)
@@ -313,18 +306,12 @@ class Viewer:
         if self.panel.follow.value:
             self.tracks.pick(point, self.settings.frame)
         if self.panel.measure.value:
-            self._measuring.add(point, self.viewable, self.settings)
+            self.measuring.add(point, self.viewable, self.settings)
         self._update_panel()
-
-    def _clear_measurement(self) -> None:
-        self._measuring.clear()
-        self._update_panel()
-
-    # Correcting tool masks.
 
     def _mask_spot(self, client: viser.ClientHandle, screen: tuple[float, float]) -> Spot | None:
         """The frame, and the position in its mask, at a position on a browser's canvas."""
-        viewport = self._browsers.viewport(client, self.viewable, self.settings)
+        viewport = self._viewport(client)
         if viewport is None or not self.settings.endoscope:
             return None
         (x, y), own = viewport.pixel(screen), self.viewable.cameras[self.settings.frame]
@@ -337,34 +324,29 @@ class Viewer:
     # Saving.
 
     def _keep_view(self, client: viser.ClientHandle) -> None:
-        viewport = self._browsers.viewport(client, self.viewable, self.settings)
+        viewport = self._viewport(client)
         if len(self.kept_views) >= MAX_KEPT:
             self._browsers.notify("Not saved", f"The limit is {MAX_KEPT} views.")
         elif viewport is not None:
             self.kept_views.append(PathPoint(self.settings.frame, viewport.camera))
         self._update_panel()
 
-    def _forget_views(self) -> None:
-        self.kept_views = []
-        self._update_panel()
-
     def _screenshot(self, client: viser.ClientHandle) -> None:
-        viewport = self._browsers.viewport(client, self.viewable, self.settings)
-        if viewport is None:
-            return
-        picture = encode_png(self._picture(self.settings, viewport.camera))
-        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", picture)
+        if (viewport := self._viewport(client)) is not None:
+            picture = encode_png(self._picture(self.settings, viewport.camera))
+            self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", picture)
 
     def _save_video(self, client: viser.ClientHandle) -> None:
-        viewport = self._browsers.viewport(client, self.viewable, self.settings)
+        settings, viewport = self.settings, self._viewport(client)
         if viewport is None:
             return
-        settings = self.settings
         if len(self.kept_views) > 1:
             settings, places = replace(settings, endoscope=False), interpolate(self.kept_views)
+        elif settings.endoscope:
+            places = follow_frames(self.viewable.cameras)
         else:
-            free, rides_from = viewport.camera, settings.frame if settings.riding else None
-            places = follow_frames(self.viewable.cameras, None if settings.endoscope else free, rides_from)
+            rides_from = settings.frame if settings.riding else None
+            places = follow_frames(self.viewable.cameras, viewport.camera, rides_from)
         if len(places) > MAX_PICTURES:
             self._browsers.notify("No video", f"Expected at most {MAX_PICTURES} images, got {len(places)}.")
             return
@@ -373,22 +355,44 @@ class Viewer:
         pictures = (self._picture(replace(settings, frame=place.frame), place.camera) for place in places)
         self._offer(client, f"{settings.layer}.mp4", mp4_bytes(pictures, self.viewable.frames_per_second))
 
+    def _save_table(self, client: viser.ClientHandle) -> None:
+        table = self.measuring.table(self.viewable, self.settings)
+        if table is None:
+            self._browsers.notify("Nothing measured", "Check Measure by clicking, and click points.")
+        else:
+            self._offer(client, "measures.csv", table.encode())
+
     def _offer(self, client: viser.ClientHandle, name: str, content: bytes) -> None:
         """Send a file to the browser, and store it in `out`."""
         client.send_file_download(name, content)
         if self.out is not None:
             self._browsers.notify("Saved", str(keep(self.out, name, content)))
 
-    def _save_table(self, client: viser.ClientHandle) -> None:
-        table = self._measuring.table(self.viewable, self.settings)
-        if table is None:
-            self._browsers.notify("Nothing measured", "Check Measure by clicking, and click points.")
-        else:
-            self._offer(client, "measures.csv", table.encode())
 
-    # Text of the panel.
+def mp4_bytes(pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> bytes:
+    """Images (H, W, 3) of one size as an H.264 video."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "video.mp4"
+        write_video(file, pictures, frames_per_second)
+        return file.read_bytes()
 
-    def _update_panel(self) -> None:
-        """Update the texts and the chart of the panel."""
-        self.panel.status.content = panel.status(self.viewable, self.settings, len(self.kept_views))
-        self._measuring.show(self.viewable, self.settings.frame)
+
+def keep(folder: Path, name: str, content: bytes) -> Path:
+    """Write a file with the first free name `stem_N.suffix` in `folder`, and return its path; never overwrite a file.
+
+    Args:
+        name: a plain file name.
+    Raises:
+        ValueError: `name` contains a folder, or has no suffix.
+        InputError: `folder` is a link: in an untrusted run it could point anywhere.
+    """
+    if folder.is_symlink():
+        raise input_error(folder, "a folder", "a link to one", "Remove the link.")
+    stem, suffix = Path(name).stem, Path(name).suffix
+    if Path(name).name != name or not suffix:
+        raise ValueError(f"name must be a plain file name with a suffix, got {name!r}")
+    numbered = (folder / f"{stem}_{number}{suffix}" for number in count(1))
+    file = next(path for path in numbered if not path.exists())
+    with whole_file(file) as temporary:
+        temporary.write_bytes(content)
+    return file

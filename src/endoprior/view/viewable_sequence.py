@@ -8,13 +8,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry import back_project, length_unit, pixel_centers
+from ..core.geometry import back_project, camera_to_world, length_unit, pixel_centers
 from ..core.types import Camera
 from ..data import FrameSequence
 from ..model.carry import CarriedPoints
 from ..priors import joint_texture_prior
+from ..visualization.image_tools import colorize
 from . import layers
-from .mask_edits import MaskEdits
+from .mask_editor import MaskEdits
 from .viewable import Cloud, Layer, ViewSettings
 
 MAX_POINTS = 100_000
@@ -23,14 +24,13 @@ DEFAULT_FRAMES_PER_SECOND = 25.0
 
 
 class ViewableSequence:
-    """Frames of a sequence folder."""
+    """Frames of a sequence folder; its methods are those of `ViewableScene`."""
 
     layers: tuple[Layer, ...] = ("frame", "depth", "prior")
     has_tool = True
 
     def __init__(self, sequence: FrameSequence) -> None:
-        self.sequence = sequence
-        self.title = str(sequence.path)
+        self.sequence, self.title = sequence, str(sequence.path)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         self.frames_per_second = sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND
         self.relative = sequence.depth_is_relative
@@ -51,27 +51,19 @@ class ViewableSequence:
         """From another camera, the measured points."""
         if not settings.endoscope:
             return self._dots(settings, camera)[0]
-        frame = self.sequence.frame(settings.frame)
+        frame, tool = self.sequence.frame(settings.frame), self._masks.tool(settings.frame)
+        original = picture = layers.fitted(frame.rgb_u8, camera)
         if settings.layer == "depth":
-            picture = layers.depth_picture(self.surface(settings, camera), self.span)
+            depth = self.surface(settings, camera)
+            picture = colorize(depth, *self.span, depth > 0)
         elif settings.layer == "prior":
-            picture = layers.colorize(self._prior(settings.frame, camera), 0, 1)
-        else:
-            picture = layers.fitted(frame.rgb_u8, camera)
-            if settings.near > 0 or settings.far < float("inf"):
-                picture = picture * (self.surface(settings, camera) > 0)[..., None]
-        tool = layers.fitted(self._masks.tool(settings.frame), camera)
+            picture = colorize(layers.fitted(joint_texture_prior(frame.rgb, ~tool), camera), 0, 1)
+        elif settings.near > 0 or settings.far < float("inf"):
+            picture = picture * (self.surface(settings, camera) > 0)[..., None]
+        tool = layers.fitted(tool, camera)
         if settings.correcting:
             return layers.with_mask(picture, tool)
-        return layers.with_tool(picture, layers.fitted(frame.rgb_u8, camera), ~tool) if settings.tool else picture
-
-    def _dots(self, settings: ViewSettings, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        cloud = self.cloud(settings)
-        return layers.render_points(cloud.points, cloud.colors, cloud.size, camera)
-
-    def _prior(self, index: int, camera: Camera) -> NDArray[np.float32]:
-        frame = self.sequence.frame(index)
-        return layers.fitted(joint_texture_prior(frame.rgb, ~self._masks.tool(index)), camera)
+        return layers.with_tool(picture, original, tool) if settings.tool else picture
 
     def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
         """The measured depth."""
@@ -80,6 +72,10 @@ class ViewableSequence:
         frame = self.sequence.frame(settings.frame)
         depth = frame.depth * (frame.depth_valid & (frame.depth >= settings.near) & (frame.depth <= settings.far))
         return layers.fitted(depth.astype(np.float32), camera)
+
+    def _dots(self, settings: ViewSettings, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        cloud = self.cloud(settings)
+        return layers.render_points(cloud.points, cloud.colors, cloud.size, camera)
 
     def renders_in_browser(self, settings: ViewSettings) -> bool:
         """From another camera there are only the points."""
@@ -96,9 +92,9 @@ class ViewableSequence:
         pixels = pixel_centers(camera.width, camera.height)[rows, columns]
         points = back_project(pixels.astype(np.float64), depth[rows, columns].astype(np.float64), camera)
         colors = self.picture(settings, camera)[rows, columns]
-        return Cloud(points.astype(np.float32), colors, None, None, step * sum(self.span) / 2 / camera.fy)
+        return Cloud(points.astype(np.float32), colors, step * sum(self.span) / 2 / camera.fy)
 
-    def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
+    def stretch(self, points: NDArray, _since: int) -> NDArray[np.float64]:
         """Unknown before training."""
         return np.full((len(self.cameras), len(points)), np.nan)
 
@@ -108,25 +104,23 @@ class ViewableSequence:
         paths[frames, range(len(frames))] = points
         return _certain(paths)
 
-    def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
+    def shows(self, points: NDArray, _frame: int) -> NDArray[np.bool_]:
         """Where points are known, they are seen."""
-        return np.isfinite(points).all(-1)
+        return np.isfinite(points.sum(-1))
 
     def tracks(self) -> CarriedPoints:
         """The tracks of the ground truth, if there are any."""
         tracks = self.sequence.truth.tracks if self.sequence.truth else None
         if tracks is None or not tracks.paired:
             return _certain(np.zeros((len(self.cameras), 0, 3)))
-        poses = np.stack([np.linalg.inv(camera.world_to_camera) for camera in self.cameras])
+        poses = camera_to_world(self.cameras)
         world = np.einsum("tij,tpj->tpi", poses[:, :3, :3], tracks.points) + poses[:, None, :3, 3]
         return _certain(np.where(tracks.visible[..., None], world, np.nan))
 
     def legend(self, settings: ViewSettings) -> str:
-        unit = length_unit(self.relative)
-        return {
-            "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
-            "prior": "joint texture prior: blue 0 to red 1",
-        }.get(settings.layer, "")
+        """Meaning of the colors in one line; empty for plain color."""
+        depth = "blue {:.1f} to red {:.1f} {}".format(*self.span, length_unit(self.relative))
+        return {"depth": depth, "prior": "joint texture prior: blue 0 to red 1"}.get(settings.layer, "")
 
 
 def _certain(paths: NDArray) -> CarriedPoints:

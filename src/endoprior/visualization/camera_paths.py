@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.types import Camera, Frame
 from ..data.reading import read_text
 
@@ -31,7 +31,7 @@ def sway_path(times: list[float], cameras: tuple[Camera, ...], distance_mm: floa
     for k, (time, camera) in enumerate(times_path(times, cameras)):
         angle = 2 * np.pi * k / max(len(times), 1)
         shift = SWAY_SHARE * distance_mm * np.array([np.sin(angle), 0.6 * (1 - np.cos(angle)), 0])
-        views.append((time, replace(camera, world_to_camera=_looking(shift, distance_mm) @ camera.world_to_camera)))
+        views.append((time, _looking(camera, shift, distance_mm)))
     return views
 
 
@@ -39,7 +39,7 @@ def turned(camera: Camera, degrees: float, distance_mm: float) -> Camera:
     """`camera`, turned about a vertical axis through the point `distance_mm` ahead; above 0 it moves to its right."""
     angle = np.deg2rad(degrees)
     position = distance_mm * np.array([np.sin(angle), 0, 1 - np.cos(angle)])
-    return replace(camera, world_to_camera=_looking(position, distance_mm) @ camera.world_to_camera)
+    return _looking(camera, position, distance_mm)
 
 
 def tissue_distance(frame: Frame, otherwise: float) -> float:
@@ -48,16 +48,15 @@ def tissue_distance(frame: Frame, otherwise: float) -> float:
     return float(np.median(depths)) if depths.size else otherwise
 
 
-def _looking(position: NDArray, distance: float) -> NDArray:
-    """(4, 4) transform from camera axes to those of a camera at `position` that points at (0, 0, distance)."""
+def _looking(camera: Camera, position: NDArray, distance: float) -> Camera:
+    """`camera`, moved to a `position` in its own axes, pointing at (0, 0, distance) there."""
     forward = np.array([0, 0, distance]) - position
     forward /= np.linalg.norm(forward)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    matrix = np.eye(4)
+    rotation, matrix = np.stack([right, np.cross(forward, right), forward]), np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position
-    return matrix
+    return replace(camera, world_to_camera=matrix @ camera.world_to_camera)
 
 
 def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
@@ -68,11 +67,9 @@ def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
     Raises:
         InputError: the file is missing, is not such a list, or a matrix is not a rigid transform.
     """
+    text = read_text(file, "a camera path", "Correct the file.")
     try:
-        entries = json.loads(read_text(file, "a camera path", "Correct the file."))
-        views = [_view(entry, cameras) for entry in entries]
-    except InputError:
-        raise
+        views = [_view(entry, cameras) for entry in json.loads(text)]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         want = 'a JSON list of {"time": .., "world_to_camera": 4 x 4}'
         raise input_error(file, want, repr(error), "Correct the file.") from None
@@ -85,7 +82,7 @@ def _view(entry: dict, cameras: tuple[Camera, ...]) -> View:
     time = float(entry["time"])
     if not 0 <= time <= 1:
         raise ValueError(f"time {time} is not in [0, 1]")
-    (_, camera), *_ = times_path([time], cameras)
+    ((_, camera),) = times_path([time], cameras)
     if "world_to_camera" not in entry:
         return time, camera
     matrix = np.asarray(entry["world_to_camera"], np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -36,9 +36,15 @@ def gray(unit: NDArray) -> NDArray[np.uint8]:
 
 def colorize(values: NDArray, low: float, high: float, valid: NDArray | None = None) -> NDArray[np.uint8]:
     """Turbo color map of (H, W) values: blue at `low`, red at `high`; black where `valid` is False."""
-    span = max(high - low, 1e-9)
-    colors = cv2.applyColorMap(to_u8((np.nan_to_num(values) - low) / span), cv2.COLORMAP_TURBO)[..., ::-1]
+    unit = to_u8((np.nan_to_num(values) - low) / max(high - low, 1e-9))
+    colors: NDArray = cv2.applyColorMap(unit, cv2.COLORMAP_TURBO)[..., ::-1]
     return colors if valid is None else colors * np.asarray(valid, np.uint8)[..., None]
+
+
+def scaled(image: NDArray, width_px: int) -> NDArray:
+    """An image of that width: colors averaged, a mask (H, W) of 8 bits by the nearest pixel."""
+    size = width_px, max(round(image.shape[0] * width_px / image.shape[1]), 1)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if image.ndim == 3 else cv2.INTER_NEAREST)
 
 
 def label(rgb_u8: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
@@ -55,29 +61,24 @@ def label(rgb_u8: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
 
 def tile(images: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
     """Images of one size, tiled row by row in `columns`; missing ones are black."""
-    blank = np.zeros_like(images[0])
-    padded = images + [blank] * (-len(images) % columns)
-    rows = [np.concatenate(padded[i : i + columns], 1) for i in range(0, len(padded), columns)]
-    return np.concatenate(rows, 0)
+    padded = images + [np.zeros_like(images[0])] * (-len(images) % columns)
+    return np.concatenate([np.concatenate(padded[i : i + columns], 1) for i in range(0, len(padded), columns)])
 
 
 def mask_sheet(
-    frames: Sequence[tuple[NDArray[np.uint8], NDArray[np.bool_], str]], columns: int, width_px: int
+    frames: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_], str]], columns: int, width_px: int
 ) -> NDArray[np.uint8]:
-    """Frames with their masks tinted and outlined.
+    """Frames with their masks tinted and outlined, in rows of `columns`.
 
     Args:
         frames: image (H, W, 3), mask (H, W), text in its corner.
         width_px: of a frame on the sheet.
-    Returns:
-        (rows * h, columns * width_px, 3).
     """
     tiles = []
     for rgb_u8, mask, text in frames:
-        size = (width_px, round(rgb_u8.shape[0] * width_px / rgb_u8.shape[1]))
-        image = cv2.resize(rgb_u8, size, interpolation=cv2.INTER_AREA)
-        tool = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        image, tool = scaled(rgb_u8, width_px), scaled(mask.astype(np.uint8), width_px)
         image[tool > 0] = (0.6 * image[tool > 0] + 0.4 * np.array(MASK_COLOR)).astype(np.uint8)
         outlines, _ = cv2.findContours(tool, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        tiles.append(label(cv2.drawContours(image, outlines, -1, MASK_COLOR, 1), text))
+        cv2.drawContours(image, outlines, -1, MASK_COLOR, 1)
+        tiles.append(label(image, text))
     return tile(tiles, columns)

@@ -1,11 +1,11 @@
-"""Measures over time for people and spreadsheets: a CSV table, maps of the surface, curves."""
+"""Measures over time for people and spreadsheets: a CSV table, maps of the surface, curves. T frames, P points."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,21 +26,23 @@ LEAST_DISPLACEMENT, LEAST_STRETCH = 1e-3, 0.05
 
 def displacement_span(values: NDArray) -> tuple[float, float]:
     """Ends of the color scale: 0 to the 98th percentile of what is known."""
-    known = values[np.isfinite(values)]
-    return 0.0, max(float(np.percentile(known, 98)) if len(known) else 0.0, LEAST_DISPLACEMENT)
+    return 0.0, _reach(values, LEAST_DISPLACEMENT)
 
 
 def stretch_span(values: NDArray) -> tuple[float, float]:
     """Ends of the color scale, as far below 1 as above it: unchanged tissue is in the middle."""
-    known = np.abs(values[np.isfinite(values)] - 1)
-    reach = max(float(np.percentile(known, 98)) if len(known) else 0.0, LEAST_STRETCH)
+    reach = _reach(np.abs(values - 1), LEAST_STRETCH)
     return 1 - reach, 1 + reach
+
+
+def _reach(values: NDArray, least: float) -> float:
+    known = values[np.isfinite(values)]
+    return max(float(np.percentile(known, 98)) if len(known) else 0.0, least)
 
 
 def value_colors(values: NDArray, span: tuple[float, float]) -> NDArray[np.uint8]:
     """(N, 3) turbo colors of (N,) values; gray where unknown."""
-    colors = colorize(values[None], *span)[0]
-    return np.where(np.isfinite(values)[:, None], colors, np.uint8(UNKNOWN_GRAY))
+    return np.where(np.isfinite(values)[:, None], colorize(values[None], *span)[0], np.uint8(UNKNOWN_GRAY))
 
 
 def measures_csv(found: Measures, frames_per_second: float, unit: str, confidence: NDArray | None = None) -> str:
@@ -61,13 +63,14 @@ def measures_csv(found: Measures, frames_per_second: float, unit: str, confidenc
         columns[f"distance_{name}"] = _texts(found.distance)
     if num_points > 2:
         columns[f"area_{name}2"] = _texts(found.area)
+    of_points = {
+        f"path_{{}}_{name}": found.path_length,
+        f"path_raw_{{}}_{name}": found.path_length_raw,
+        f"displacement_{{}}_{name}": found.displacement,
+        "stretch_{}": found.stretch,
+    } | ({} if confidence is None else {"confidence_{}": confidence})
     for p in range(num_points):
-        columns[f"path_{p}_{name}"] = _texts(found.path_length[:, p])
-        columns[f"path_raw_{p}_{name}"] = _texts(found.path_length_raw[:, p])
-        columns[f"displacement_{p}_{name}"] = _texts(found.displacement[:, p])
-        columns[f"stretch_{p}"] = _texts(found.stretch[:, p])
-        if confidence is not None:
-            columns[f"confidence_{p}"] = _texts(confidence[:, p])
+        columns |= {column.format(p): _texts(values[:, p]) for column, values in of_points.items()}
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(columns)
@@ -79,69 +82,72 @@ def _texts(values: NDArray) -> list[str]:
     return [f"{value:.4f}" if math.isfinite(value) else "" for value in values]
 
 
-class MeasuresFigure:
-    """A figure: surface maps on top, curves over time below them."""
+def write_figure(
+    path: Path,
+    title: str,
+    image: NDArray,
+    points: NDArray,
+    surface: tuple[NDArray, NDArray],
+    maps: Mapping[str, tuple[NDArray, tuple[float, float]]],
+    curves: tuple[Measures, float, str] | None,
+) -> None:
+    """Write a PNG file, completely or not at all: surface maps on top, curves over time below them.
 
-    def __init__(self, title: str, with_curves: bool) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # which takes long to import
-        from matplotlib.figure import Figure
+    Args:
+        image: (H, W, 3), which shows the points (P, 2), px, numbered as in the table.
+        surface: (V, 2) pixels of a mesh's vertices, and (F, 3) their numbers in triangles.
+        maps: by title, two maps of values (V,) with the ends of their color scale.
+        curves: measures, frames per second and unit of lengths; None for no curves.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # which takes long to import
+    from matplotlib.figure import Figure
 
-        # An own canvas: `pyplot` would choose a backend for the whole process.
-        self._figure = Figure(figsize=(13, 10 if with_curves else 4.2), layout="constrained", dpi=100)
-        FigureCanvasAgg(self._figure)
-        self._figure.suptitle(title, fontsize=11, parse_math=False)
-        parts = self._figure.subfigures(
-            2 if with_curves else 1, 1, squeeze=False, height_ratios=[4, 6][: 1 + with_curves]
-        )
-        self._maps = parts[0, 0].subplots(1, 3)
-        self._top, self._curves = parts[0, 0], parts[1, 0] if with_curves else None
-        for axis in self._maps:
-            axis.set_axis_off()
-
-    def show_points(self, image: NDArray, pixels: NDArray) -> None:
-        """The image (H, W, 3) with the points (P, 2), px, numbered as in the table."""
-        axis = self._maps[0]
-        axis.imshow(image, extent=(0, image.shape[1], image.shape[0], 0))
-        axis.set_title("points", fontsize=9)
-        if len(pixels) > 1:
-            axis.plot(*np.concatenate([pixels, pixels[:1]]).T, color="yellow", linewidth=0.8)
-        for p, (x, y) in enumerate(pixels):
-            axis.plot(x, y, "o", color=f"C{p}", markeredgecolor="white", markersize=6)
-            axis.annotate(str(p), (x, y), (5, 4), textcoords="offset points", color="white", fontsize=9)
-        axis.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
-
-    def show_map(
-        self, place: int, title: str, pixels: NDArray, triangles: NDArray, values: NDArray, span: tuple[float, float]
-    ) -> None:
-        """Values (V,) of mesh vertices at pixels (V, 2), as a map in place 1 or 2."""
-        axis = self._maps[place]
+    # An own canvas: `pyplot` would choose a backend for the whole process.
+    figure = Figure(figsize=(13, 10 if curves else 4.2), layout="constrained", dpi=100)
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=11, parse_math=False)
+    rows = 2 if curves else 1
+    parts = figure.subfigures(rows, 1, squeeze=False, height_ratios=[4, 6][:rows])[:, 0]
+    first, *others = parts[0].subplots(1, 3)
+    for axis in (first, *others):
+        axis.set_axis_off()
+    if curves:
+        _show_curves(parts[1].subplots(2, 3).ravel(), *curves)
+    height, width = image.shape[:2]
+    first.imshow(image, extent=(0, width, height, 0))
+    first.set_title("points", fontsize=9)
+    if len(points) > 1:
+        first.plot(*np.concatenate([points, points[:1]]).T, color="yellow", linewidth=0.8)
+    for p, (x, y) in enumerate(points):
+        first.plot(x, y, "o", color=f"C{p}", markeredgecolor="white", markersize=6)
+        first.annotate(str(p), (x, y), (5, 4), textcoords="offset points", color="white", fontsize=9)
+    first.set(xlim=(0, width), ylim=(height, 0))
+    (pixels, triangles), limits = surface, {"xlim": first.get_xlim(), "ylim": first.get_ylim()}
+    for axis, (name, (values, (low, high))) in zip(others, maps.items(), strict=True):
         faces = np.ma.masked_invalid(values[triangles].mean(1))
-        shown = axis.tripcolor(*pixels.T, triangles, facecolors=faces, cmap="turbo", vmin=span[0], vmax=span[1])
-        axis.set_title(title, fontsize=9)
-        axis.set(xlim=self._maps[0].get_xlim(), ylim=self._maps[0].get_ylim(), aspect="equal")
-        self._top.colorbar(shown, ax=axis, fraction=0.04, pad=0.01).ax.tick_params(labelsize=8)
+        shown = axis.tripcolor(*pixels.T, triangles, facecolors=faces, cmap="turbo", vmin=low, vmax=high)
+        axis.set_title(name, fontsize=9)
+        axis.set(**limits, aspect="equal")
+        parts[0].colorbar(shown, ax=axis, fraction=0.04, pad=0.01).ax.tick_params(labelsize=8)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
 
-    def show_curves(self, found: Measures, frames_per_second: float, unit: str) -> None:
-        """Every measure over time, in seconds; points in the colors of the image."""
-        seconds = np.arange(len(found.displacement)) / frames_per_second
-        axes = self._curves.subplots(2, 3).ravel()
-        _plot(axes[0], f"distance of points 0 and 1, {unit}", seconds, found.distance[:, None], "black")
-        _plot(axes[1], f"area of the polygon, {unit}²", seconds, found.area[:, None], "black")
-        _plot(axes[3], f"displacement since frame {found.since}, {unit}", seconds, found.displacement)
-        _plot(axes[4], f"stretch since frame {found.since}; 1: unchanged", seconds, found.stretch)
-        _plot(axes[2], f"path length, {unit}; dotted: without smoothing", seconds, found.path_length)
-        for p in range(found.path_length_raw.shape[1]):
-            axes[2].plot(seconds, found.path_length_raw[:, p], color=f"C{p}", linewidth=0.8, linestyle=":")
-        axes[5].set_axis_off()
-        for axis in axes[:5]:
-            axis.set_xlabel("s", fontsize=8)
-        handles, labels = axes[3].get_legend_handles_labels()
-        axes[5].legend(handles, labels, title="point", loc="upper left", fontsize=8, ncols=3)
 
-    def save(self, path: Path) -> None:
-        """Write the PNG file, completely or not at all."""
-        with whole_file(path) as temporary:
-            self._figure.savefig(temporary)
+def _show_curves(axes: NDArray, found: Measures, frames_per_second: float, unit: str) -> None:
+    """Every measure over time, in seconds; points in the colors of the image."""
+    seconds = np.arange(len(found.displacement)) / frames_per_second
+    _plot(axes[0], f"distance of points 0 and 1, {unit}", seconds, found.distance[:, None], "black")
+    _plot(axes[1], f"area of the polygon, {unit}²", seconds, found.area[:, None], "black")
+    _plot(axes[3], f"displacement since frame {found.since}, {unit}", seconds, found.displacement)
+    _plot(axes[4], f"stretch since frame {found.since}; 1: unchanged", seconds, found.stretch)
+    _plot(axes[2], f"path length, {unit}; dotted: without smoothing", seconds, found.path_length)
+    for p in range(found.path_length_raw.shape[1]):
+        axes[2].plot(seconds, found.path_length_raw[:, p], color=f"C{p}", linewidth=0.8, linestyle=":")
+    axes[5].set_axis_off()
+    for axis in axes[:5]:
+        axis.set_xlabel("s", fontsize=8)
+    handles, labels = axes[3].get_legend_handles_labels()
+    axes[5].legend(handles, labels, title="point", loc="upper left", fontsize=8, ncols=3)
 
 
 def _plot(axis: Axes, title: str, seconds: NDArray, values: NDArray, color: str | None = None) -> None:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..data import FrameSequence, Split
 from ..priors import joint_texture_prior, salience, specular_likelihood
 from ..system.atomic import reject_occupied, whole_folder
-from .image_tools import colorize, gray, label, tile, to_u8, write_png
+from .image_tools import colorize, gray, label, scaled, tile, to_u8, write_png
 
-SHEET_FRAMES = 6
-SHEET_WIDTH_PX = 320
+SHEET_FRAMES, SHEET_WIDTH_PX = 6, 320
 
 
 def write_prior_maps(sequence: FrameSequence, split: Split, out: Path) -> Path:
@@ -26,9 +24,8 @@ def write_prior_maps(sequence: FrameSequence, split: Split, out: Path) -> Path:
         InputError: `out` exists and is not empty.
     """
     reject_occupied(out)
-    frames = sequence.frames(split)
-    shown = set(np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).astype(int).tolist())
-    rows: list[NDArray[np.uint8]] = []
+    frames, rows = sequence.frames(split), list[NDArray[np.uint8]]()
+    shown = np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).astype(int)
     with whole_folder(out) as folder:
         for position, frame in enumerate(frames):
             maps = {
@@ -41,11 +38,6 @@ def write_prior_maps(sequence: FrameSequence, split: Split, out: Path) -> Path:
             if position in shown:
                 images = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": gray(frame.tissue_mask)}
                 images |= {name: colorize(values, 0, 1) for name, values in maps.items()}
-                rows += [label(_small(image), name) for name, image in images.items()]
+                rows += [label(scaled(image, SHEET_WIDTH_PX), name) for name, image in images.items()]
         write_png(folder / "contact_sheet.png", tile(rows, 5))
     return out / "contact_sheet.png"
-
-
-def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height = max(round(image.shape[0] * SHEET_WIDTH_PX / image.shape[1]), 1)
-    return cv2.resize(image, (SHEET_WIDTH_PX, height), interpolation=cv2.INTER_AREA)

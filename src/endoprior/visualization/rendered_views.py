@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.types import Frame, RenderedView
+from ..core.types import Frame
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .camera_paths import View
@@ -26,15 +26,17 @@ def write_views(scene: Scene, views: list[View], out: Path, video: Path, frames:
         frames: the input frames, one per view; without them the side-by-side shows color and depth only.
         video: path of the mp4 of the side-by-side images.
     """
-    span = depth_span(scene)
+    span, at_a_time = depth_span(scene), 1 if scene.device.type == "cpu" else AT_A_TIME
 
     def pictures() -> Iterator[list[NDArray[np.uint8]]]:
-        for k, rendered in enumerate(_render(scene, views)):
-            color, depth = to_u8(rendered.color.cpu().numpy()), rendered.depth.cpu().numpy()
-            write_png(out / "rgb" / f"{file_stem(k, frames)}.png", color)
-            with whole_file(out / "depth" / f"{file_stem(k, frames)}.npy") as temporary:
-                np.save(temporary, depth)
-            yield [label(color, "EndoPrior-GS"), label(colorize(depth, *span, depth > 0), "depth")]
+        for start in range(0, len(views), at_a_time):
+            times, cameras = zip(*views[start : start + at_a_time], strict=True)
+            for k, rendered in enumerate(scene.render_many(list(times), list(cameras)), start):
+                color, depth = to_u8(rendered.color.cpu().numpy()), rendered.depth.cpu().numpy()
+                write_png(out / "rgb" / f"{file_stem(k, frames)}.png", color)
+                with whole_file(out / "depth" / f"{file_stem(k, frames)}.npy") as temporary:
+                    np.save(temporary, depth)
+                yield [label(color, "EndoPrior-GS"), label(colorize(depth, *span, depth > 0), "depth")]
 
     write_film(pictures(), out / "side_by_side", video, scene.frames_per_second, frames)
 
@@ -67,14 +69,6 @@ def write_film(
 def file_stem(k: int, frames: Sequence[Frame] | None) -> str:
     """Name of the files of view `k`: by its input frame, if there is one."""
     return f"{frames[k].index if frames else k:06d}"
-
-
-def _render(scene: Scene, views: list[View]) -> Iterator[RenderedView]:
-    """Render each view; in batches on a GPU."""
-    at_a_time = 1 if scene.device.type == "cpu" else AT_A_TIME
-    for start in range(0, len(views), at_a_time):
-        times, cameras = zip(*views[start : start + at_a_time], strict=True)
-        yield from scene.render_many(list(times), list(cameras))
 
 
 def depth_span(scene: Scene) -> tuple[float, float]:

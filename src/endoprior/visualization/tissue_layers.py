@@ -6,8 +6,8 @@ Three numbers for each Gaussian are blended as if they were its color, and decid
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,14 +26,12 @@ from .camera_paths import View
 from .image_tools import SOLID_ALPHA, label, to_u8
 from .rendered_views import file_stem, write_film
 
-SQUARES = 40
-"""Squares of the grid along the width of the image: 16 px of 640."""
+SQUARES, STRIPES = 40, 80
+"""Squares of the grid and stripes of the hatching along the width of the image: 16 px and 8 px of 640."""
 LINE, LINE_COLOR, LINE_SHARE = 0.2, np.array((0.3, 1.0, 1.0)), 0.5
 """Width of a line, in sides of a square; its light blue, which tissue does not have; share of that in its pixels."""
 FARTHEST = 2
 """Largest motion in the image that is carried, in widths of the image."""
-STRIPES = 80
-"""Stripes of the hatching along the width of the image."""
 HATCHING, TINT = np.array((1.0, 1.0, 1.0)), np.array((0.2, 0.5, 1.0))
 """Colors of stripes, and of tissue from another time."""
 HATCHING_SHARE, TINT_SHARE = 0.6, 0.5
@@ -42,10 +40,9 @@ TINTED_FROM_S, FULL_TINT_S = 0.1, 2.0
 """Tissue last seen so long before or after gets some tint, and all of it."""
 
 
-@torch.no_grad()
-def _rendered(backend: str, splats: Splats, camera: Camera, numbers: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+def _rendered(scene: Scene, splats: Splats, camera: Camera, numbers: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """(H, W, 3) color, (H, W, 3) blended numbers, (H, W) alpha of one view; `numbers` is (N, 3) in [0, 1]."""
-    rasterize, black = render.load(backend), splats.means.new_zeros(3)
+    rasterize, black = render.load(scene.backend), splats.means.new_zeros(3)
     color = rasterize(splats, camera, background=black).view.color
     out = rasterize(with_colors(splats, numbers), camera, background=black)
     return color.cpu().numpy(), out.color.cpu().numpy(), out.alpha.cpu().numpy()
@@ -75,7 +72,7 @@ class PaintedTissue:
         pixels, _ = project(splats.means.cpu().numpy().astype(np.float64), camera)
         span = 2 * FARTHEST * camera.width
         numbers = np.column_stack([np.clip((before - pixels) / span + 0.5, 0, 1), painted])
-        color, blended, alpha = _rendered(self._scene.backend, splats, camera, numbers)
+        color, blended, alpha = _rendered(self._scene, splats, camera, numbers)
         back = (blended[..., :2] / np.maximum(alpha[..., None], 1e-6) - 0.5) * span
         lines = _grid(pixel_centers(camera.width, camera.height) + back, self._square)
         share = LINE_SHARE * blended[..., 2:] * lines[..., None]
@@ -88,8 +85,7 @@ def _grid(pixels: NDArray, side: float) -> NDArray[np.float64]:
     return np.clip(0.5 + LINE / 2 * side - distance, 0, 1)
 
 
-@dataclass(frozen=True)
-class SupportPicture:
+class SupportPicture(NamedTuple):
     """What one camera sees at one time, and where it is from."""
 
     color: NDArray[np.float32]
@@ -104,7 +100,6 @@ class SupportMap:
     """Renders a scene with what its training frames saw of it."""
 
     def __init__(self, scene: Scene, frames_of: FramesOf) -> None:
-        """Args: frames_of: the frames that each window was trained on."""
         self._scene, self._support = scene, Support(scene, frames_of)
         self._longest = len(scene.cameras) / scene.frames_per_second
 
@@ -114,7 +109,7 @@ class SupportMap:
         frames, gap = self._support.num_frames(time), self._support.gap(time)
         guessed, most, longest = ~np.isfinite(gap), max(frames.max(initial=0), 1), self._longest
         numbers = np.column_stack([frames / most, np.where(guessed, 0, gap / longest), guessed])
-        color, blended, alpha = _rendered(self._scene.backend, self._scene.at(time), camera, numbers)
+        color, blended, alpha = _rendered(self._scene, self._scene.at(time), camera, numbers)
         solid = alpha > SOLID_ALPHA
         share, gap, guess = np.moveaxis(blended / np.where(solid, alpha, 1)[..., None], -1, 0)
         seconds = gap / np.maximum(1 - guess, 1e-6) * longest

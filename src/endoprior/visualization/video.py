@@ -9,6 +9,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
@@ -69,5 +70,5 @@ def num_frames(path: Path) -> int:
     try:
         with open_container(path) as video:
             return sum(packet.size > 0 and not packet.is_corrupt for packet in video.demux(video=0))
-    except (av.FFmpegError, OSError, IndexError):
+    except (FFmpegError, OSError, IndexError):
         return 0

@@ -18,8 +18,7 @@ from endoprior.data import FrameSequence
 from endoprior.model.scene_file import check_cameras
 from endoprior.system.arrays_file import ArraySpec, part
 from endoprior.training.divergence import LARGEST_GRADIENT, Diverged, Watch, unusable_numbers
-from endoprior.training.stage import Stage, StepReport, stage_length
-from endoprior.training.trainer import DEFAULT_FRAMES_PER_SECOND, Trainer, device_for
+from endoprior.training.trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
 
 from .field import RadianceField, RayBatch
 from .presets import radiance_of

@@ -6,13 +6,13 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from endoprior.cli.arguments import Help, parse
+from endoprior.cli.arguments import Command, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
 
 
 @dataclass
-class BenchMasks:
+class BenchMasks(Command):
     """Train the network that finds tools without each set of real frames, and score it on that set.
 
     A network takes hours. Networks in OUT are kept, and an interrupted training resumes. The clips are read from
@@ -30,13 +30,12 @@ class BenchMasks:
     write_weights: Path | None = None
     """Also write the weights of the network that was trained with all sets to this file."""
 
-
-HELP = Help(examples=(("OUT",), ("OUT", "--steps", "500")))
+    examples = ("OUT", "OUT --steps 500")
 
 
 def run(argv: list[str]) -> int:
     """Train, score, write the report."""
-    args = parse(BenchMasks, argv, "bench masks", HELP)
+    args = parse(BenchMasks, argv, "bench masks")
     if not 1 <= args.steps <= 10**6:
         raise input_error("--steps", "1 to 1000000", f"{args.steps}", "Choose a value in this range.")
     root = Path(os.environ.get("ENDOPRIOR_DATA", ""))
@@ -45,7 +44,7 @@ def run(argv: list[str]) -> int:
         raise input_error("ENDOPRIOR_DATA", "the folder of the clips", repr(str(root)), f"Set {fix}")
     from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
-    from endoprior.tool_masks.weights import network_from_file
+    from endoprior.tool_masks.network import network_from_file
 
     from .leave_one_out import ALL, Training, rows, weights_file, write_report
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from endoprior.system.atomic import whole_file, write_json, write_text
 from endoprior.tool_masks import ToolFinder
-from endoprior.tool_masks.network import ToolNetwork
-from endoprior.tool_masks.weights import network_from, weights_of
+from endoprior.tool_masks.network import ToolNetwork, network_from, weights_of
 from endoprior.visualization.image_tools import label, write_png
 
 from .benchmark import SHOWN, SetScore, pictures, score_set

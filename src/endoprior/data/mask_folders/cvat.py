@@ -9,8 +9,7 @@ corner. Names of frames are those of the images of the task.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,19 +19,17 @@ from numpy.typing import NDArray
 
 from ...core.checks import input_error
 from ..files import files_with, in_order
-from ..images import decode_image
+from ..images import Size, decode_image
+from ..mask_files import Mask, demand_size
 from ..reading import kind_of, read_text
-from .parts import Mask, MaskFolder, MaskFrame, Size, demand_size, mask_of_runs, sorted_frames, tool_labels, words_about
+from .parts import MaskFolder, MaskFrame, mask_of_runs, sorted_frames, tool_labels, words_about
 
 CLASSES, LABELS, LISTED = "SegmentationClass", "labelmap.txt", Path("ImageSets", "Segmentation", "default.txt")
 PNG_HINT = "Export the task from CVAT as `Segmentation mask 1.1` again."
-Color = tuple[int, int, int]
-SHAPES = ("mask", "polygon")
 XML_HINT = "Export the task from CVAT as `CVAT for images 1.1`."
-MOST_PX = 1 << 16
-"""Largest coordinate of a point."""
-Shape = tuple[str, Mapping[str, str]]
-"""Tag and attributes."""
+SHAPES = ("mask", "polygon")
+MOST_PX = 1 << 16  # largest coordinate of a point
+Color = tuple[int, int, int]
 
 
 def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
@@ -40,20 +37,23 @@ def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
     root = folder.parent if folder.name == CLASSES else folder
     if kind_of(root / CLASSES) != "a folder" or kind_of(root / LABELS) != "a file":
         return None
-    colors = read_labelmap(root / LABELS)
-    labels = list(colors)
-    tools = tool_labels(root / LABELS, [name for name in labels if name != "background"], asked)
+    colors = _labelmap(root / LABELS)
+    labels = [name for name in colors if name != "background"]
+    tools = tool_labels(root / LABELS, labels, asked)
     files = {file.stem: file for file in files_with(root / CLASSES, (".png",))}
-    listed = _listed(root / LISTED)
-    # Images without a shape are listed, but some versions write no mask for them.
-    names = [file.name for file in in_order(map(Path, {*files, *listed}))]
+    listed = ""
+    if kind_of(root / LISTED) == "a file":  # images without a shape, for which some versions write no mask
+        listed = read_text(root / LISTED, "a list of images", PNG_HINT)
+    every = {*files, *(Path(line.strip()).name for line in listed.splitlines() if line.strip())}
     wanted = [colors[name] for name in tools]
-    frames = [MaskFrame(f"{name}.png", _reader(files.get(name), colors, wanted)) for name in names]
-    rest = [name for name in labels if name != "background"]
-    return MaskFolder(frames, f"CVAT segmentation masks; {words_about(rest, tools)}", True)
+    frames = [
+        MaskFrame(f"{file.name}.png", _reader(files.get(file.name), colors, wanted))
+        for file in in_order(map(Path, every))
+    ]
+    return MaskFolder(frames, f"CVAT segmentation masks; {words_about(labels, tools)}", True)
 
 
-def read_labelmap(file: Path) -> dict[str, Color]:
+def _labelmap(file: Path) -> dict[str, Color]:
     """Label -> color (red, green, blue), in the order of the file."""
     found: dict[str, Color] = {}
     for line in read_text(file, "CVAT's labels", PNG_HINT).splitlines():
@@ -70,15 +70,6 @@ def read_labelmap(file: Path) -> dict[str, Color]:
     if not found:
         raise input_error(file, "at least one label", "none", PNG_HINT)
     return found
-
-
-def _listed(file: Path) -> list[str]:
-    """Names of the images of the task; none if there is no list."""
-    if kind_of(file) != "a file":
-        return []
-    return [
-        Path(line.strip()).name for line in read_text(file, "a list of images", PNG_HINT).splitlines() if line.strip()
-    ]
 
 
 def _reader(file: Path | None, colors: dict[str, Color], wanted: list[Color]) -> Callable[[Size], Mask]:
@@ -104,7 +95,7 @@ def _packed(colors: NDArray) -> NDArray[np.int64]:
     return colors.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
 
 
-def annotations(file: Path, asked: str) -> MaskFolder | None:
+def xml_annotations(file: Path, asked: str) -> MaskFolder | None:
     """The masks in an XML file of CVAT; None for another XML file."""
     text = read_text(file, "an XML file", XML_HINT)
     if "<annotations" not in text:
@@ -132,47 +123,42 @@ def annotations(file: Path, asked: str) -> MaskFolder | None:
 
 def _frame(file: Path, image: ElementTree.Element, tools: list[str]) -> MaskFrame:
     name = Path(image.get("name", "")).name
-    shapes = [(shape.tag, shape.attrib) for shape in image if shape.tag in SHAPES and shape.get("label") in tools]
+    subject = f"{file}: {name}"
+    shapes = [shape for shape in image if shape.tag in SHAPES and shape.get("label") in tools]
 
     def read(size: Size) -> Mask:
         mask = np.zeros(size[::-1], bool)
-        with _damage_named(f"{file}: {name}"):
+        try:
             own_size = int(image.get("width", 0)), int(image.get("height", 0))
-        demand_size(f"{file}: {name}", own_size, size)
-        with _damage_named(f"{file}: {name}"):
-            for shape in shapes:
-                _paint(mask, shape)
+            if own_size == size:
+                for shape in shapes:
+                    (_paint_polygon if shape.tag == "polygon" else _paint_runs)(mask, shape.attrib)
+        except KeyError as error:
+            raise input_error(subject, f"the attribute {error}", "none", XML_HINT) from None
+        except (OverflowError, ValueError) as error:
+            raise input_error(subject, "masks and polygons", str(error)[:80], XML_HINT) from None
+        demand_size(subject, own_size, size)
         return mask
 
     return MaskFrame(name, read)
 
 
-@contextmanager
-def _damage_named(subject: str) -> Iterator[None]:
-    """Turn errors of damaged numbers into one that names the image."""
-    try:
-        yield
-    except KeyError as error:
-        raise input_error(subject, f"the attribute {error}", "none", XML_HINT) from None
-    except (OverflowError, ValueError) as error:
-        raise input_error(subject, "masks and polygons", str(error)[:80], XML_HINT) from None
+def _paint_polygon(mask: Mask, given: dict[str, str]) -> None:
+    """Add a shape with these attributes to a mask (H, W). ValueError or KeyError if it is not one."""
+    pairs = [point.split(",") for point in given["points"].split(";")]
+    if any(len(pair) != 2 for pair in pairs):
+        raise ValueError("points that are not x,y;x,y")
+    points = np.array(pairs, float)
+    if not (np.abs(points) < MOST_PX).all():
+        raise ValueError("points far outside of the image")
+    painted = mask.astype(np.uint8)
+    # OpenCV counts centers of pixels from 0.
+    cv2.fillPoly(painted, [np.round(points - 0.5).astype(np.int32)], 1)
+    mask |= painted > 0
 
 
-def _paint(mask: Mask, shape: Shape) -> None:
-    """Add a shape to a mask (H, W). ValueError or KeyError if it is not one."""
-    tag, given = shape
-    if tag == "polygon":
-        pairs = [point.split(",") for point in given["points"].split(";")]
-        if any(len(pair) != 2 for pair in pairs):
-            raise ValueError("points that are not x,y;x,y")
-        points = np.array(pairs, float)
-        if not (np.abs(points) < MOST_PX).all():
-            raise ValueError("points far outside of the image")
-        painted = mask.astype(np.uint8)
-        # OpenCV counts centers of pixels from 0.
-        cv2.fillPoly(painted, [np.round(points - 0.5).astype(np.int32)], 1)
-        mask |= painted > 0
-        return
+def _paint_runs(mask: Mask, given: dict[str, str]) -> None:
+    """As `_paint_polygon`, from run lengths in a box."""
     left, top, width, height = (int(float(given[side])) for side in ("left", "top", "width", "height"))
     if min(left, top) < 0 or min(width, height) < 1 or left + width > mask.shape[1] or top + height > mask.shape[0]:
         raise ValueError("a box outside of the image")

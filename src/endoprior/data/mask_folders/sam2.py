@@ -2,6 +2,7 @@
 
 `vos_inference.py` writes OUT/VIDEO/00000.png with the object numbers as values of a palette image, or, for objects that
 overlap, OUT/VIDEO/OBJECT/00000.png. The annotations of SA-V are one JSON: a run-length code per frame and object.
+All objects are tools, unless some are asked for: they have numbers in place of names.
 """
 
 from __future__ import annotations
@@ -14,15 +15,13 @@ import numpy as np
 
 from ...core.checks import input_error
 from ..files import entries, files_with, in_order
-from ..images import decode_image
-from ..mask_files import MASK_SUFFIXES
+from ..images import Size, decode_image
+from ..mask_files import MASK_SUFFIXES, OPTION, Mask, demand_size
 from ..reading import read_bytes, read_text
-from .parts import Mask, MaskFolder, MaskFrame, Size, chosen_objects, demand_size, mask_of_coco, union, union_of_files
+from .parts import MaskFolder, MaskFrame, mask_of_coco, tool_labels, union, union_of_files
 
-PALETTE_IMAGE = 3
-"""Color type in the header of a PNG."""
-MOST_FRAMES = 10_000_000
-"""Of a video."""
+PALETTE_IMAGE = 3  # color type in the header of a PNG
+MOST_FRAMES = 10_000_000  # of a video
 HINT = "Write it with the program of SA-V, or pass masks as PNG."
 
 
@@ -36,7 +35,7 @@ def palette_folder(folder: Path, asked: str) -> MaskFolder | None:
         return None
     wanted = [int(name) for name in asked.split(",") if name.strip().isdigit()]
     if asked and not wanted:
-        raise input_error("--mask-labels", f"numbers of objects in {folder}", asked, "`--mask-labels 1`.")
+        raise input_error(OPTION, f"numbers of objects in {folder}", asked, f"`{OPTION} 1`.")
 
     def reader(file: Path):
         return lambda size: _objects(file, size, wanted)
@@ -51,7 +50,8 @@ def object_folders(folder: Path, asked: str) -> MaskFolder | None:
     parts = in_order(each for each in entries(folder) if each.is_dir() and each.name.isdigit())
     if not parts or files_with(folder, MASK_SUFFIXES):
         return None
-    tools = chosen_objects(folder, [part.name for part in parts], asked)
+    objects = [part.name for part in parts]
+    tools = tool_labels(folder, objects, asked) if asked else objects
     by_name: dict[str, list[Path]] = {}
     for part in parts:
         for file in files_with(part, MASK_SUFFIXES):
@@ -67,22 +67,21 @@ def sav_file(file: Path, asked: str) -> MaskFolder | None:
     """Annotations of SA-V, `VIDEO_manual.json` or `VIDEO_auto.json`; None for another JSON."""
     try:
         stored = json.loads(read_text(file, "a JSON file", HINT))
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
-    if not isinstance(stored, dict) or not isinstance(stored.get("masklet"), list):
+    if not isinstance(stored, dict) or not isinstance(masklets := stored.get("masklet"), list):
         return None
-    masklets = stored["masklet"]
     if not masklets or not all(isinstance(frame, list) for frame in masklets):
         raise input_error(file, "masklet to hold a list of objects per frame", "something else", HINT)
     count = max(len(frame) for frame in masklets)
     given = stored.get("masklet_id")
     ids = [str(each) for each in (given if isinstance(given, list) and len(given) == count else range(count))]
-    tools = chosen_objects(file, ids, asked)
+    tools = tool_labels(file, ids, asked) if asked else ids
     wanted = [i for i, name in enumerate(ids) if name in tools]
     # Every fourth frame of the video is annotated: the number of a mask is that of its frame in the video.
     total = stored.get("video_frame_count")
-    known = isinstance(total, int | float) and 0 < total < MOST_FRAMES
-    step = max(1, round(total / len(masklets))) if known else 1
+    known = total if isinstance(total, int | float) and 0 < total < MOST_FRAMES else 0
+    step = max(1, round(known / len(masklets)))
 
     def reader(frame: list[Any]):
         return lambda size: union((_sav_mask(file, frame[i], size) for i in wanted if i < len(frame)), size)
@@ -121,7 +120,7 @@ def _palette(file: Path) -> np.ndarray:
     """(N, 3) red, green, blue of a palette PNG; (0, 3) for another image."""
     data = read_bytes(file).tobytes()
     at = data.find(b"PLTE", 33)
-    if data[12:16] != b"IHDR" or data[25] != PALETTE_IMAGE or at < 0:
+    if at < 0 or data[12:16] != b"IHDR" or data[25] != PALETTE_IMAGE:
         return np.zeros((0, 3), np.uint8)
     length = int.from_bytes(data[at - 4 : at], "big") // 3 * 3
     return np.frombuffer(data[at + 4 : at + 4 + length], np.uint8).reshape(-1, 3)

@@ -1,14 +1,10 @@
-"""Score the frames of a reconstruction as the evaluation scripts of other papers do, with what makes scores comparable.
-
-Every number stands under the name of its protocol. What a protocol needs and this machine or sequence lacks is a
-skipped score with its reason, as everywhere.
-"""
+"""Score the frames of a reconstruction as the evaluation scripts of other papers do, with tags to compare them by."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -24,29 +20,28 @@ from ..context import EXACT, NETWORKS_OFF, EvaluationContext, RenderedFrame, Sce
 from ..score import ScoreUnavailable, mean_over_frames
 from ..scorers.depth import depth_rmse, depth_rmse_8bit
 from ..scorers.image import SquaredErrors, pooled_psnr, squared_errors, ssim, ssim_valid
-from ..scorers.lpips import LpipsDistance, lpips_distance
+from ..scorers.lpips import Backbone, LpipsDistance, lpips_distance
 from .table import KEYS, PROTOCOLS, Protocol
 
 NO_TISSUE = "no tissue in the frames"
 NO_DEPTH = "no tissue with measured depth"
 BACKGROUNDS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
-Load = Callable[[str], LpipsDistance | ScoreUnavailable]
+Load = Callable[[Backbone], LpipsDistance | ScoreUnavailable]
+Images = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
+"""(H, W, 3) rendered and true color in [0, 1], (H, W) tissue mask, as a script compares them: cropped and masked."""
 
 
 def score_protocols(names: Sequence[str], context: EvaluationContext, reading: DataConfig) -> dict[str, dict[str, Any]]:
-    """Score the frames of the split by each protocol.
+    """Score the frames by each protocol: `title`, `source`, `tags`, `paper`, `differs`, `scores`, `skipped` by its
+    name.
 
-    Args:
-        context: the evaluation whose rendered frames are scored.
-        reading: how its sequence was read: other masks of the same folder are read in the same way.
-    Returns:
-        By name a dict in JSON's types: `title`, `source`, `tags`, `paper`, `differs`, `scores` and `skipped`. `tags` is
-        empty where the masks of the protocol are missing, and all scores are skipped.
+    `reading` says how the sequence was read: other masks of the same folder are read in the same way. Where the masks
+    of a protocol are missing, `tags` is empty and all scores are skipped.
     """
 
     @cache
-    def load(backbone: str) -> LpipsDistance | ScoreUnavailable:
+    def load(backbone: Backbone) -> LpipsDistance | ScoreUnavailable:
         """Each classifier once, for all protocols; why not where it cannot be had."""
         if not context.networks:
             return ScoreUnavailable(NETWORKS_OFF)
@@ -59,106 +54,77 @@ def score_protocols(names: Sequence[str], context: EvaluationContext, reading: D
 
 
 def _score(about: Protocol, context: EvaluationContext, reading: DataConfig, load: Load) -> dict[str, Any]:
+    skipped: dict[str, str] = {}
     result: dict[str, Any] = {"title": about.title, "source": about.source, "tags": {}, "paper": dict(about.paper)}
-    result |= {"differs": list(about.differs), "scores": {}, "skipped": {}}
-    skipped = result["skipped"]
-    structure = ssim_valid if about.ssim_valid else ssim
-    measures: dict[str, Callable[[_View], float]] = {"ssim": lambda view: structure(view.image, view.target, view.mask)}
+    result |= {"differs": list(about.differs), "scores": {}, "skipped": skipped}
+    measures: dict[str, Callable[..., float]] = {"ssim": ssim_valid if about.ssim_valid else ssim}
     network = load(about.lpips)
     if isinstance(network, ScoreUnavailable):
         skipped["lpips"] = str(network)
     else:
-        distance = replace(network, lowest=about.lpips_lowest)
-        measures["lpips"] = lambda view: distance(view.image, view.target, view.mask)
-    if about.depth:
-        measures["depth_rmse_mm" if about.depth.startswith("mm") else "depth_rmse_8bit"] = _depth_by(about)
+        measures["lpips"] = replace(network, lowest=about.lpips_lowest)
+    depth_name = "depth_rmse_mm" if about.depth.startswith("mm") else "depth_rmse_8bit"
     try:
         masks = masks_of(about, context.sequence, reading)
     except ScoreUnavailable as reason:
-        result["skipped"] = dict.fromkeys(["psnr", *measures, *skipped], str(reason))
-        return result
+        names = ["psnr", *measures, *([depth_name] if about.depth else []), *skipped]
+        return result | {"skipped": dict.fromkeys(names, str(reason))}
     indices = [i for i in context.sequence.indices(context.split) if not (about.skips_first and i == 0)]
     result["tags"] = tags_of(about, context, indices, masks.mask_folder, reading.shrink)
     errors: list[SquaredErrors] = []
     counts: list[int] = []
-    values: dict[str, list[float]] = {name: [] for name in measures}
+    values: dict[str, list[float]] = {name: [] for name in (*measures, *([depth_name] if about.depth else []))}
     for index in indices:
-        view = _view(about, masks.frame(index), context.rendered[index], reading.shrink)
-        errors.append(squared_errors(view.image, view.target, view.mask))
-        counts.append(int(view.measured.sum()))
-        for name in [name for name in measures if name not in skipped]:
+        frame, rendered = masks.frame(index), context.rendered[index]
+        images = _images(about, frame, rendered, reading.shrink)
+        errors.append(squared_errors(*images))
+        counts.append(int((images[2] & frame.depth_valid[: len(images[2])]).sum()))
+        for name in [name for name in values if name not in skipped]:
             try:
-                values[name].append(measures[name](view))
+                depth_or_image = measures[name](*images) if name in measures else _depth(about, frame, rendered, images)
+                values[name].append(depth_or_image)
             except ScoreUnavailable as reason:
                 skipped[name] = str(reason)
     together = [errors] if about.pooled else [[error] for error in errors]
     found = {"psnr": mean_over_frames(pooled_psnr(group, over_frame=about.over_frame) for group in together)}
-    found |= {name: mean_over_frames(values[name]) for name in measures if name not in skipped}
+    found |= {name: mean_over_frames(values[name]) for name in values if name not in skipped}
     if about.depth == "mm, pooled" and "depth_rmse_mm" in found:
         totals = [n * error**2 if n else 0.0 for n, error in zip(counts, values["depth_rmse_mm"], strict=True)]
         found["depth_rmse_mm"] = float(np.sqrt(sum(totals) / sum(counts))) if sum(counts) else math.nan
+    equal = not any(error.total for error in errors) and any(error.of_tissue for error in errors)
     for name, value in found.items():
         if math.isfinite(value):
             result["scores"][name] = value
         else:
-            equal = not any(error.total for error in errors) and any(error.of_tissue for error in errors)
             skipped[name] = EXACT if equal and name == "psnr" else NO_DEPTH if "depth" in name else NO_TISSUE
     return result
 
 
-@dataclass(frozen=True)
-class _View:
-    """One frame as a script compares it: cropped, masked and rounded by its rules."""
-
-    image: NDArray[np.float32]
-    """(H, W, 3) rendered color in [0, 1]."""
-    target: NDArray[np.float32]
-    """(H, W, 3) true color in [0, 1]."""
-    mask: NDArray[np.bool_]
-    """(H, W) True = tissue."""
-    measured: NDArray[np.bool_]
-    """(H, W) True = tissue with measured depth."""
-    frame: Frame
-    """For its depth; not cropped."""
-    rendered: RenderedFrame
-    """For its depth; not cropped."""
-
-
-def _view(about: Protocol, frame: Frame, rendered: RenderedFrame, shrink: int) -> _View:
+def _images(about: Protocol, frame: Frame, rendered: RenderedFrame, shrink: int) -> Images:
     kept, masked = rows_of(about, frame.tissue_mask.shape[0], shrink)
     mask = frame.tissue_mask[:kept].copy()
     mask[kept - masked :] = False
-    image = rendered.rgb if about.rounded else rendered.color
-    return _View(image[:kept], frame.rgb[:kept], mask, mask & frame.depth_valid[:kept], frame, rendered)
+    return (rendered.rgb if about.rounded else rendered.color)[:kept], frame.rgb[:kept], mask
 
 
-def _depth_by(about: Protocol) -> Callable[[_View], float]:
+def _depth(about: Protocol, frame: Frame, rendered: RenderedFrame, images: Images) -> float:
     """The depth error of one frame; NaN where nothing was measured."""
-
-    def in_mm(view: _View) -> float:
-        rows = len(view.mask)
-        return depth_rmse(view.rendered.depth[:rows], view.frame.depth[:rows], view.measured)
-
-    def in_8_bits(view: _View) -> float:
-        rows, frame = len(view.mask), view.frame
-        depth = view.rendered.depth[:rows]
-        if not frame.depth_valid.any():
-            return math.nan
-        # The readers of these programs set missing depth to the nearest measured one, and score it.
-        target = np.where(frame.depth_valid, frame.depth, frame.depth[frame.depth_valid].min())[:rows]
-        if about.depth == "8-bit, tissue":
-            return depth_rmse_8bit(depth, target, view.mask, int(view.mask.sum()))
-        return depth_rmse_8bit(depth, target, view.mask & (np.fmod(target, 256) >= 1), view.mask.size)
-
-    return in_mm if about.depth.startswith("mm") else in_8_bits
+    mask = images[2]
+    rows = len(mask)
+    depth = rendered.depth[:rows]
+    if about.depth.startswith("mm"):
+        return depth_rmse(depth, frame.depth[:rows], mask & frame.depth_valid[:rows])
+    if not frame.depth_valid.any():
+        return math.nan
+    # The readers of these programs set missing depth to the nearest measured one, and score it.
+    target = np.where(frame.depth_valid, frame.depth, frame.depth[frame.depth_valid].min())[:rows]
+    if about.depth == "8-bit, tissue":
+        return depth_rmse_8bit(depth, target, mask, int(mask.sum()))
+    return depth_rmse_8bit(depth, target, mask & (np.fmod(target, 256) >= 1), mask.size)
 
 
 def masks_of(protocol: Protocol, sequence: FrameSequence, reading: DataConfig) -> FrameSequence:
-    """The sequence with the masks that a protocol reads: itself, or the same folder read again.
-
-    Raises:
-        ScoreUnavailable: there are no such masks.
-    """
+    """The sequence with the masks that a protocol reads, or the same folder read again; else ScoreUnavailable."""
     has_own = (sequence.path / "gt_masks").is_dir()
     if protocol.masks == "gt_masks" and not has_own:
         raise ScoreUnavailable("needs tool masks in gt_masks/, and the sequence has no such folder")
@@ -181,14 +147,11 @@ def masks_of(protocol: Protocol, sequence: FrameSequence, reading: DataConfig) -
 def tags_of(
     protocol: Protocol, context: EvaluationContext, indices: Sequence[int], mask_folder: str, shrink: int
 ) -> dict[str, str]:
-    """The tags of one evaluation under a protocol, by the names of `KEYS`.
-
-    Args:
-        indices: the frames that are scored.
-        mask_folder: `FrameSequence.mask_folder` of the masks in use.
-        shrink: what the size of the frames was divided by.
+    """The tags of one evaluation of frames `indices` under a protocol, by the names of `KEYS`. `mask_folder` is that of
+    the masks in use; the size of the frames was divided by `shrink`.
     """
-    made, is_scene = context.reconstruction, isinstance(context.reconstruction, SceneFrames)
+    made = context.reconstruction
+    scene = made.scene if isinstance(made, SceneFrames) else None
     seen, total = len({*indices} - {*context.sequence.indices("test")}), len(indices)
     height = context.sequence.camera(0).height
     kept, masked = rows_of(protocol, height, shrink)
@@ -197,10 +160,10 @@ def tags_of(
     phase = context.sequence.test_phase
     values = {
         "split": f"{context.split}{f' {phase}/8' if phase else ''}, {total} {'without 0' if without else 'frames'}",
-        "saw_test_frames": (f"yes: {seen} of {total}" if seen else "no") if is_scene else "not known",
+        "saw_test_frames": (f"yes: {seen} of {total}" if seen else "no") if scene else "not known",
         "mask_folder": mask_folder or "none: by the reader",
         "rows": rows + (f", {masked} masked" if masked else ""),
-        "background": BACKGROUNDS[method_of(made.scene.config).background] if is_scene else "of the images",
+        "background": BACKGROUNDS[method_of(scene.config).background] if scene else "of the images",
         "color": "8 bits" if protocol.rounded else "not rounded",
         "psnr_over": "all pixels" if protocol.over_frame else "tissue pixels",
         "psnr_mean": "all frames together" if protocol.pooled else "mean of frames",
@@ -212,11 +175,8 @@ def tags_of(
 
 
 def rows_of(protocol: Protocol, height: int, shrink: int) -> tuple[int, int]:
-    """How many rows from the top are scored, and how many of these at the bottom count as tool.
-
-    Args:
-        height: of a frame as it is read, px.
-        shrink: what its size was divided by. Rows of the table are those of full size.
+    """How many rows from the top are scored, and how many of these at the bottom count as tool, of frames of this
+    height, px. The size was divided by `shrink`; rows of the table are those of full size.
     """
     kept = min(height, protocol.kept_rows // shrink) if protocol.kept_rows else height
     return kept, min(kept, -(-protocol.masked_rows // shrink))

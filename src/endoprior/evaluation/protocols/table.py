@@ -10,8 +10,7 @@ from ...system.plugins import Registry
 from ..score import Score
 
 DepthRule = Literal["", "mm, mean of frames", "mm, pooled", "8-bit, all pixels", "8-bit, tissue"]
-ALL = "all"
-"""In place of a list of protocols."""
+ALL = "all"  # In place of a list of protocols
 
 
 @dataclass(frozen=True)
@@ -88,11 +87,7 @@ SCORES: dict[str, Score] = {
 
 
 def chosen_protocols(text: str) -> tuple[str, ...]:
-    """The names in a list with commas, each once, in the order of `PROTOCOLS`; all of them for `all`.
-
-    Raises:
-        InputError: an empty or unknown name.
-    """
+    """The names in a list with commas, each once, in the order of `PROTOCOLS`; all of them for `all`."""
     names, known = [name.strip() for name in text.split(",")], PROTOCOLS.names()
     for name in names:
         if name not in (*known, ALL):

@@ -17,37 +17,24 @@ from numpy.typing import NDArray
 from ...core.checks import check_shape
 from ...core.geometry import camera_to_world
 from ..context import EvaluationContext
-from ..score import Score
+from ..score import scores_from
 
 AXIS_MM = 1e-3
 """Each camera axis counts as a point this far from the camera's center when paths are aligned, mm.
 
 Far too little to matter where the camera moves, enough to decide what its centers leave open: the turn about a straight
 path, or every turn of a camera at rest. A true path whose RMS distance from its mean is smaller is at rest."""
-ROUNDING = 1e-12
-"""An estimated path is at rest if its extent is below this share of its largest coordinate."""
-SCORES = (
-    Score(
-        "ate_mm", "camera path error", "mm", False, 3,
-        "Root mean square distance of camera centers from the true ones, after alignment; with ground truth only.",
-        group="motion", hint="0 is the true path", in_true_mm=True,
-    ),
-    Score(
-        "rpe_mm", "camera step error", "mm", False, 3,
-        "Root mean square error of the camera's translation from frame to frame.",
-        group="motion", in_summary=False, in_true_mm=True,
-    ),
-    Score(
-        "rpe_deg", "camera turn error", "deg", False, 3,
-        "Mean angle by which the camera's turn from frame to frame is wrong.",
-        group="motion", hint="0 turns as the true camera",
-    ),
-    Score(
-        "rotation_error_deg", "camera rotation error", "deg", False, 3,
-        "Mean angle between the camera's axes and the true ones, after alignment.",
-        group="motion", in_summary=False,
-    ),
-)  # fmt: skip
+ROUNDING = 1e-12  # An estimated path is at rest if its extent is below this share of its largest coordinate
+SCORES = scores_from("""
+    ate_mm | camera path error | true mm | lower | 3 | relative | motion | 0 is the true path
+        Root mean square distance of camera centers from the true ones, after alignment; with ground truth only.
+    rpe_mm | camera step error | true mm | lower | 3 | relative | motion | -
+        Root mean square error of the camera's translation from frame to frame.
+    rpe_deg | camera turn error | deg | lower | 3 | relative | motion | 0 turns as the true camera
+        Mean angle by which the camera's turn from frame to frame is wrong.
+    rotation_error_deg | camera rotation error | deg | lower | 3 | relative | motion | -
+        Mean angle between the camera's axes and the true ones, after alignment.
+""")
 ONE_FRAME = "a single frame has no motion"
 
 
@@ -64,36 +51,31 @@ def compute(context: EvaluationContext) -> None:
 class TrajectoryErrors(NamedTuple):
     """Errors of a camera path after alignment; lengths in mm of the true path."""
 
-    ate_mm: float
-    """Absolute trajectory error: root mean square distance of aligned and true camera centers."""
+    ate_mm: float  # Absolute trajectory error: root mean square distance of aligned and true camera centers
     rpe_mm: float
     """Relative pose error: root mean square length by which the motion from frame to frame is wrong; NaN if T = 1."""
     rpe_deg: float
     """Arithmetic mean, not root mean square, of the angle by which that motion is wrong, degrees; NaN if T = 1."""
-    rotation_error_deg: float
-    """Arithmetic mean over frames of the angle between aligned and true camera axes, degrees."""
-    scale: float
-    """Factor of the estimated lengths in the alignment; 1 without scale."""
+    rotation_error_deg: float  # Arithmetic mean over frames of the angle between aligned and true camera axes, degrees
+    scale: float  # Factor of the estimated lengths in the alignment; 1 without scale
 
 
 def trajectory_errors(
     estimated: NDArray[np.floating], true: NDArray[np.floating], with_scale: bool
 ) -> TrajectoryErrors:
-    """Align the estimated path with the true one and compare them.
+    """Align the estimated path (T, 4, 4) with the true one, mm, and compare them: `with_scale` by Sim(3), else by
+    SE(3).
 
     The relative error of frames i, i + 1 is (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}), with Q the true and P the estimated
     poses, whose lengths are scaled. It depends on no world axes. Two frames say little of a path: with scale, their
     absolute error is always 0.
-
-    Args:
-        estimated, true: (T, 4, 4) rigid camera-to-world, T > 0, mm; estimated lengths in any unit if `with_scale`.
-        with_scale: align by a similarity, Sim(3), in place of a rigid motion, SE(3): for relative depth.
     """
     estimated, true = np.asarray(estimated, np.float64), np.asarray(true, np.float64)
     check_shape("estimated:T,4,4 true:T,4,4", estimated=estimated, true=true)
     scale, rotation, translation = align_paths(estimated, true, with_scale)
     centers = scale * estimated[:, :3, 3] @ rotation.T + translation
-    motion, true_motion = _motions(estimated), _motions(true)
+    # (T - 1, 4, 4) pose of each next camera in the axes of the one before.
+    motion, true_motion = (np.linalg.solve(poses[:-1], poses[1:]) for poses in (estimated, true))
     wrong_mm = np.linalg.norm(scale * motion[:, :3, 3] - true_motion[:, :3, 3], axis=-1)
     wrong_deg = _angles_deg(true_motion[:, :3, :3].transpose(0, 2, 1) @ motion[:, :3, :3])
     turned_deg = _angles_deg(true[:, :3, :3].transpose(0, 2, 1) @ rotation @ estimated[:, :3, :3])
@@ -114,9 +96,6 @@ def align_paths(
     It minimizes the sum of squared distances. Where centers leave the rotation open (a camera at rest, a straight path,
     two frames), the axes of the cameras decide it, each counted as a point `AXIS_MM` from the center. A scale that
     nothing determines, because one of the two cameras is at rest, is 1.
-
-    Args:
-        estimated, true: (T, 4, 4) camera-to-world, T > 0.
     """
     mean, true_mean = estimated[:, :3, 3].mean(0), true[:, :3, 3].mean(0)
     points, true_points = estimated[:, :3, 3] - mean, true[:, :3, 3] - true_mean
@@ -127,22 +106,12 @@ def align_paths(
     if moves:
         covariance = true_points.T @ (points / extent) * (true_extent / len(points))
     axes = np.einsum("tij,tkj->ik", true[:, :3, :3], estimated[:, :3, :3]) / len(points)
-    rotation = _nearest_rotation(covariance + AXIS_MM**2 * axes)
+    u, _, vt = np.linalg.svd(covariance + AXIS_MM**2 * axes)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt  # of determinant 1 and the largest trace
     scale = 1.0
     if with_scale and moves and true_extent > AXIS_MM:
         scale = max(float((rotation * covariance).sum()), 0.0) / (true_extent * extent)
     return scale, rotation, true_mean - scale * rotation @ mean
-
-
-def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation R, determinant 1, of the largest trace of R^T `matrix`, (3, 3)."""
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-
-
-def _motions(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T - 1, 4, 4) pose of each next camera in the axes of the one before."""
-    return np.linalg.solve(poses[:-1], poses[1:])
 
 
 def _angles_deg(rotations: NDArray[np.float64]) -> NDArray[np.float64]:

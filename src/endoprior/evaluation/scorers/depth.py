@@ -13,29 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
-from ..score import Score
+from ...footage.components import Mask
+from ..score import scores_from
 from .image import check_finite_float, checked_mask
 
 if TYPE_CHECKING:
     from ..context import EvaluationContext
 
-SCORES = (
-    Score(
-        "depth_rmse_mm", "depth RMSE", "mm", False, 3,
-        "Root mean square error of rendered depth where depth was measured on tissue.",
-        group="depth", hint="0 is exact; measured depth errs too",
-    ),
-    Score(
-        "depth_rmse_endogaussian", "depth RMSE (EndoGaussian's)", "", False, 3,
-        "The depth figure of EndoGaussian's program, whose 8-bit depths wrap; only to compare with its tables.",
-        group="depth", in_summary=False,
-    ),
-    Score(
-        "depth_instability_mm", "depth instability", "mm", False, 3,
-        "The published one: mean absolute change of rendered depth on tissue between adjacent frames of the video.",
-        group="depth", hint="includes true motion",
-    ),
-)  # fmt: skip
+SCORES = scores_from("""
+    depth_rmse_mm | depth RMSE | mm | lower | 3 | relative | depth | 0 is exact; measured depth errs too
+        Root mean square error of rendered depth where depth was measured on tissue.
+    depth_rmse_endogaussian | depth RMSE (EndoGaussian's) |  | lower | 3 | relative | depth | -
+        The depth figure of EndoGaussian's program, whose 8-bit depths wrap; only to compare with its tables.
+    depth_instability_mm | depth instability | mm | lower | 3 | relative | depth | includes true motion
+        The published one: mean absolute change of rendered depth on tissue between adjacent frames of the video.
+""")
 
 
 def compute(context: EvaluationContext) -> None:
@@ -49,33 +41,26 @@ def compute(context: EvaluationContext) -> None:
             rows.append({"depth_rmse_mm": rmse, "depth_rmse_endogaussian": wrapped})
         context.add_frames(rows, "no tissue with measured depth")
     with context.skip_if_unavailable("depth_instability_mm"):
-        values = []
+        values, rendered = [], context.rendered
         for a, b in pairwise(context.video):
-            depth_a, depth_b = context.rendered[a.index].depth, context.rendered[b.index].depth
-            values.append(depth_instability(depth_a, depth_b, a.tissue_mask, b.tissue_mask))
+            pair = rendered[a.index].depth, rendered[b.index].depth
+            values.append(depth_instability(*pair, a.tissue_mask, b.tissue_mask))
         context.add_mean("depth_instability_mm", values, "no two adjacent frames share rendered tissue")
 
 
-def depth_rmse(depth: NDArray, target: NDArray, valid: NDArray[np.bool_]) -> float:
-    """Root mean square depth error over the valid pixels, mm; NaN where there is none.
-
-    A hole in the rendered depth (0) counts as an error of the full depth. Values outside `valid` may be anything.
+def depth_rmse(depth: NDArray, target: NDArray, valid: Mask) -> float:
+    """Root mean square depth error over the valid pixels, mm; NaN where there is none. A hole in the rendered depth (0)
+    counts as an error of the full depth. Values outside `valid` may be anything.
     """
     error = _valid_differences(depth, target, valid)
     return float(np.sqrt(np.mean(error * error))) if error.size else float("nan")
 
 
-def depth_rmse_8bit(depth: NDArray, target: NDArray, counted: NDArray[np.bool_], pixels: int) -> float:
+def depth_rmse_8bit(depth: NDArray, target: NDArray, counted: Mask, pixels: int) -> float:
     """A depth figure of 8-bit files, only to compare with published tables of programs that print it.
 
-    Values, differences and squares wrap modulo 256, so a 16 mm error counts as 0 and 20 mm as sqrt(144). It is not an
-    error in any unit: use `depth_rmse`. EndoGaussian's evaluation counts tissue and divides by the whole frame.
-
-    Args:
-        counted: (H, W) True = add the pixel's wrapped square.
-        pixels: number that divides the sum: those of the frame, or the counted ones.
-    Returns:
-        A number without unit; NaN where no pixel counts.
+    Values, differences and squares wrap modulo 256, so a 16 mm error counts as 0 and 20 mm as sqrt(144). The sum over
+    the counted pixels is divided by `pixels`: EndoGaussian counts tissue and divides by the whole frame.
     """
     _valid_differences(depth, target, counted)
     if not counted.any():
@@ -86,20 +71,16 @@ def depth_rmse_8bit(depth: NDArray, target: NDArray, counted: NDArray[np.bool_],
     return float(np.sqrt(np.sum(difference * difference, dtype=np.int64) / pixels))
 
 
-def depth_instability(
-    depth_a: NDArray, depth_b: NDArray, mask_a: NDArray[np.bool_], mask_b: NDArray[np.bool_]
-) -> float:
-    """Mean absolute change of depth between two adjacent frames, mm: the paper's depth temporal instability.
-
-    A pixel counts where both frames show tissue and both rendered depths are positive; NaN where none does. True motion
-    counts too, so compare methods on one sequence only.
+def depth_instability(depth_a: NDArray, depth_b: NDArray, mask_a: Mask, mask_b: Mask) -> float:
+    """Mean absolute change of depth between two adjacent frames, mm: the paper's depth temporal instability. A pixel
+    counts where both show rendered tissue; NaN where none does. True motion counts too: compare on one sequence only.
     """
     change = _valid_differences(depth_b, depth_a, checked_mask(mask_a) & checked_mask(mask_b))
     rendered = ((depth_a > 0) & (depth_b > 0))[mask_a & mask_b]
     return float(np.abs(change)[rendered].mean()) if rendered.any() else float("nan")
 
 
-def _valid_differences(depth: NDArray, target: NDArray, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _valid_differences(depth: NDArray, target: NDArray, valid: Mask) -> NDArray[np.float64]:
     """(num_valid,) depth - target, mm, after the checks that this module promises."""
     check_shape("depth:H,W target:H,W valid:H,W", depth=depth, target=target, valid=checked_mask(valid))
     check_finite_float("depth at valid pixels", depth[valid])

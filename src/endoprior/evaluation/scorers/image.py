@@ -18,96 +18,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
-from ..score import Score
+from ...footage.components import Mask
+from ..score import scores_from
 
 if TYPE_CHECKING:
     from ..context import EvaluationContext
 
-SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
-"""Side and standard deviation of the Gaussian window, px."""
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Side and standard deviation of the Gaussian window, px
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Stabilizers of the luminance term, and of that of contrast and structure, for images in [0, 1]."""
-SCORES = (
-    Score(
-        "psnr", "PSNR", "dB", True, 2,
-        "The published one: both images are multiplied by the tissue mask, the mean squared error is over the frame.",
-        "absolute", group="image", hint="as published: tools count as equal",
-    ),
-    Score(
-        "psnr_tissue", "tissue PSNR", "dB", True, 2,
-        "PSNR over the tissue pixels alone.", "absolute",
-        group="image", hint="above 35 dB hard to tell from the frame",
-    ),
-    Score(
-        "ssim", "SSIM", "", True, 4,
-        "Structural similarity of the masked images over the frame.", "absolute",
-        group="image", hint="1 is identical",
-    ),
-    Score(
-        "strict_psnr", "strict PSNR", "dB", True, 2,
-        "PSNR over the tissue pixels of rendered color that is not rounded to 8 bits.",
-        "absolute", group="image", in_summary=False,
-    ),
-    Score(
-        "strict_ssim", "strict SSIM", "", True, 4,
-        "SSIM averaged over the tissue pixels, of rendered color that is not rounded to 8 bits.",
-        "absolute", group="image", in_summary=False,
-    ),
-    Score(
-        "seam_psnr", "seams", "dB", True, 2,
-        "Tissue PSNR of frames in which two windows overlap, minus that of the others; scenes of several windows only.",
-        group="image", hint="0: the borders do not show",
-    ),
-)  # fmt: skip
+SCORES = scores_from("""
+    psnr | PSNR | dB | higher | 2 | absolute | image | as published: tools count as equal
+        The published one: both images are multiplied by the tissue mask, the mean squared error is over the frame.
+    psnr_tissue | tissue PSNR | dB | higher | 2 | absolute | image | above 35 dB hard to tell from the frame
+        PSNR over the tissue pixels alone.
+    ssim | SSIM |  | higher | 4 | absolute | image | 1 is identical
+        Structural similarity of the masked images over the frame.
+    strict_psnr | strict PSNR | dB | higher | 2 | absolute | image | -
+        PSNR over the tissue pixels of rendered color that is not rounded to 8 bits.
+    strict_ssim | strict SSIM |  | higher | 4 | absolute | image | -
+        SSIM averaged over the tissue pixels, of rendered color that is not rounded to 8 bits.
+    seam_psnr | seams | dB | higher | 2 | relative | image | 0: the borders do not show
+        Tissue PSNR of frames in which two windows overlap, minus that of the others; scenes of several windows only.
+""")
 
 
 def compute(context: EvaluationContext) -> None:
     """Score every frame of the split; of several windows also their borders."""
     rows = []
     for frame in context.frames:
-        rendered, target, mask = context.rendered[frame.index], frame.rgb, frame.tissue_mask
-        image = rendered.rgb
-        rows.append(
-            {
-                "psnr": psnr(image, target, mask),
-                "psnr_tissue": psnr_tissue(image, target, mask),
-                "ssim": ssim(image, target, mask),
-                "strict_psnr": psnr_tissue(rendered.color, target, mask),
-                "strict_ssim": ssim_tissue(rendered.color, target, mask),
-            }
-        )
+        rendered, true = context.rendered[frame.index], (frame.rgb, frame.tissue_mask)
+        image, color = rendered.rgb, rendered.color
+        row = {"psnr": psnr(image, *true), "psnr_tissue": psnr_tissue(image, *true), "ssim": ssim(image, *true)}
+        rows.append(row | {"strict_psnr": psnr_tissue(color, *true), "strict_ssim": ssim_tissue(color, *true)})
     context.add_frames(rows, "no tissue in the split")
     with context.skip_if_unavailable("seam_psnr"):
-        _add_seams(context)
-
-
-def _add_seams(context: EvaluationContext) -> None:
-    """Whether the borders between the windows of a scene show; nothing for a scene of one window."""
-    scene = context.scene
-    if len(scene.windows) == 1:
-        return
-    scored = [(row["time"], row["psnr_tissue"]) for row in context.result.per_frame if "psnr_tissue" in row]
-    values = np.array([value for _, value in scored])
-    at_seam = np.array([len(scene.shown_at(time)) > 1 for time, _ in scored], bool)
-    difference = np.nan
-    if at_seam.any() and not at_seam.all():
-        difference = values[at_seam].mean() - values[~at_seam].mean()
-    context.add("seam_psnr", float(difference), "no frame of the split lies in an overlap of windows, or all do")
+        scene = context.scene
+        if len(scene.windows) == 1:
+            return
+        scored = [(row["time"], row["psnr_tissue"]) for row in context.result.per_frame if "psnr_tissue" in row]
+        values = np.array([value for _, value in scored])
+        at_seam = np.array([len(scene.shown_at(time)) > 1 for time, _ in scored], bool)
+        some = at_seam.any() and not at_seam.all()
+        difference = float(values[at_seam].mean() - values[~at_seam].mean()) if some else np.nan
+        context.add("seam_psnr", difference, "no frame of the split lies in an overlap of windows, or all do")
 
 
 @dataclass(frozen=True)
 class SquaredErrors:
     """The squared color errors of one frame."""
 
-    total: float
-    """Sum over the tissue pixels and the three channels."""
-    of_tissue: int
-    """Number of values in the sum: 3 for each tissue pixel."""
-    of_frame: int
-    """Number of values of the whole frame: 3 for each pixel."""
+    total: float  # Sum over the tissue pixels and the three channels
+    of_tissue: int  # Number of values in the sum: 3 for each tissue pixel
+    of_frame: int  # Number of values of the whole frame: 3 for each pixel
 
 
-def squared_errors(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> SquaredErrors:
+def squared_errors(image: NDArray, target: NDArray, mask: Mask) -> SquaredErrors:
     """What a frame adds to `pooled_psnr`."""
     check_images(image, target, mask)
     total = float(np.sum((image[mask].astype(np.float64) - target[mask].astype(np.float64)) ** 2))
@@ -115,13 +81,8 @@ def squared_errors(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> 
 
 
 def pooled_psnr(frames: Sequence[SquaredErrors], *, over_frame: bool) -> float:
-    """PSNR of all frames together, dB: -10 log10 of the sum of squared errors by the number of values.
-
-    Args:
-        over_frame: divide by the values of the whole frames, those outside of the mask counted as correct. It is the
-            larger one by -10 log10 of the share of tissue, about 1 dB where tissue fills 80 % of the frame.
-    Returns:
-        Infinity for equal images.
+    """PSNR of all frames together, dB: -10 log10 of the sum of squared errors by the number of values. `over_frame`
+    counts the whole frames, outside of the mask as correct: about 1 dB more where tissue fills 80 % of the frame.
     """
     total = sum(frame.total for frame in frames)
     if not sum(frame.of_tissue for frame in frames):
@@ -130,40 +91,41 @@ def pooled_psnr(frames: Sequence[SquaredErrors], *, over_frame: bool) -> float:
     return float(-10 * np.log10(total / count)) if total > 0 else float("inf")
 
 
-def psnr(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+def psnr(image: NDArray, target: NDArray, mask: Mask) -> float:
     """PSNR of the masked images over the whole frame, dB: the published one."""
     return pooled_psnr([squared_errors(image, target, mask)], over_frame=True)
 
 
-def psnr_tissue(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+def psnr_tissue(image: NDArray, target: NDArray, mask: Mask) -> float:
     """PSNR over the tissue pixels alone, dB."""
     return pooled_psnr([squared_errors(image, target, mask)], over_frame=False)
 
 
-def ssim(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+def ssim(image: NDArray, target: NDArray, mask: Mask) -> float:
     """Structural similarity of the masked images, averaged over all pixels and channels, in [-1, 1].
 
     Gaussian window of 11 px and sigma 1.5 px, zeros outside the frame, C1 = 0.01^2, C2 = 0.03^2. Windows that lie
     entirely outside the mask score 1, as in the published protocol.
     """
-    values = _ssim_map(image, target, mask)
-    return float(values.mean()) if mask.any() else float("nan")
+    return _mean(_ssim_map(image, target, mask), mask)
 
 
-def ssim_tissue(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+def ssim_tissue(image: NDArray, target: NDArray, mask: Mask) -> float:
     """`ssim` averaged over the tissue pixels alone; within windows at their border the others are black."""
-    values = _ssim_map(image, target, mask)
-    return float(values[mask].mean()) if mask.any() else float("nan")
+    return _mean(_ssim_map(image, target, mask)[mask], mask)
 
 
-def ssim_valid(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+def ssim_valid(image: NDArray, target: NDArray, mask: Mask) -> float:
     """`ssim` over the windows that lie completely inside the frame; NaN for a frame smaller than the window."""
     border = SSIM_WINDOW // 2
-    inside = _ssim_map(image, target, mask)[border:-border, border:-border]
-    return float(inside.mean()) if mask.any() and inside.size else float("nan")
+    return _mean(_ssim_map(image, target, mask)[border:-border, border:-border], mask)
 
 
-def _ssim_map(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _mean(values: NDArray[np.float64], mask: Mask) -> float:
+    return float(values.mean()) if mask.any() and values.size else float("nan")
+
+
+def _ssim_map(image: NDArray, target: NDArray, mask: Mask) -> NDArray[np.float64]:
     """(H, W, 3) structural similarity of the masked images."""
     check_images(image, target, mask)
     a = np.where(mask[..., None], image, 0).astype(np.float64)
@@ -182,17 +144,18 @@ def _window_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     kernel = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
     kernel /= kernel.sum()
-    return cv2.sepFilter2D(values, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_CONSTANT)
+    mean = cv2.sepFilter2D(values, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(mean, np.float64)
 
 
-def check_images(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> None:
+def check_images(image: NDArray, target: NDArray, mask: Mask) -> None:
     """Raise ValueError unless the three arrays fit together and both images are finite floating point."""
     check_shape("image:H,W,3 target:H,W,3 mask:H,W", image=image, target=target, mask=checked_mask(mask))
     check_finite_float("image", image)
     check_finite_float("target", target)
 
 
-def checked_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def checked_mask(mask: Mask) -> Mask:
     """The mask itself, or ValueError: `~mask` and `array[mask]` mean something else for integers."""
     if mask.dtype != np.bool_:
         raise ValueError(f"mask must be bool, True = score the pixel; got {mask.dtype}")

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.shell import missing_package
+from ...footage.components import Mask
 from ..context import NETWORKS_OFF, EvaluationContext
 from ..networks import (
     ALEXNET,
@@ -27,30 +27,22 @@ from ..networks import (
     load_weights,
     select_weights,
 )
-from ..score import Score, ScoreUnavailable
+from ..score import ScoreUnavailable, scores_from
 from .image import check_images
 
 if TYPE_CHECKING:
     from torch.nn import Module
 
-HEADS_VERSION = "0.1"
-"""Version of the calibrated heads: the one every published LPIPS figure uses."""
+HEADS_VERSION = "0.1"  # Version of the calibrated heads: the one every published LPIPS figure uses
 Backbone = Literal["alex", "squeeze", "vgg"]
 CLASSIFIERS: dict[Backbone, WeightFiles] = {"alex": ALEXNET, "squeeze": SQUEEZENET, "vgg": VGG16}
-MIN_SIZE = 32
-"""Shortest side, px: much below it the deepest features have no pixel left."""
-SCORES = (
-    Score(
-        "lpips", "LPIPS", "", False, 4,
-        "The published one: perceptual distance of the masked images by AlexNet; needs its weights.",
-        group="image", hint="0 is identical",
-    ),
-    Score(
-        "lpips_squeeze", "LPIPS (squeeze)", "", False, 4,
-        "The same by SqueezeNet, where its weights are on this machine.",
-        group="image", in_summary=False,
-    ),
-)  # fmt: skip
+MIN_SIZE = 32  # Shortest side, px: much below it the deepest features have no pixel left
+SCORES = scores_from("""
+    lpips | LPIPS |  | lower | 4 | relative | image | 0 is identical
+        The published one: perceptual distance of the masked images by AlexNet; needs its weights.
+    lpips_squeeze | LPIPS (squeeze) |  | lower | 4 | relative | image | -
+        The same by SqueezeNet, where its weights are on this machine.
+""")
 
 
 def compute(context: EvaluationContext) -> None:
@@ -58,17 +50,21 @@ def compute(context: EvaluationContext) -> None:
     if not context.networks:
         context.skip("lpips", NETWORKS_OFF)
         return
-    for name, backbone in (("lpips", "alex"), ("lpips_squeeze", "squeeze")):
-        with context.skip_if_unavailable(name):
-            distance = lpips_distance(backbone, context.weights_dir, download=backbone == "alex")
-            rows = [
-                {name: distance(context.rendered[frame.index].rgb, frame.rgb, frame.tissue_mask)}
-                for frame in context.frames
-            ]
-            context.add_frames(rows, "no tissue in the split")
+    with context.skip_if_unavailable("lpips"):
+        _add(context, "lpips", lpips_distance("alex", context.weights_dir))
+    if squeeze := squeeze_distance(context, "lpips_squeeze"):
+        with context.skip_if_unavailable("lpips_squeeze"):
+            _add(context, "lpips_squeeze", squeeze)
 
 
-def squeeze_distance(context: EvaluationContext, name: str) -> Callable[..., float] | None:
+def _add(context: EvaluationContext, name: str, distance: LpipsDistance) -> None:
+    rows = [
+        {name: distance(context.rendered[frame.index].rgb, frame.rgb, frame.tissue_mask)} for frame in context.frames
+    ]
+    context.add_frames(rows, "no tissue in the split")
+
+
+def squeeze_distance(context: EvaluationContext, name: str) -> LpipsDistance | None:
     """The distance by SqueezeNet; None, with the reason recorded for the score `name`, where it cannot be computed."""
     if not context.networks:
         context.skip(name, NETWORKS_OFF)
@@ -86,15 +82,9 @@ class LpipsDistance:
     lowest: Literal[-1, 0] = -1
     """Value of black in what the network sees; white is 1. The network is calibrated for -1."""
 
-    def __call__(self, image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+    def __call__(self, image: NDArray, target: NDArray, mask: Mask) -> float:
         """LPIPS of the masked images scaled to [lowest, 1], averaged over the frame; NaN for an empty mask.
-
-        Args:
-            image, target: (H, W, 3) rendered and true color in [0, 1].
-            mask: (H, W) True = tissue; everything else is black in both images.
-        Raises:
-            ValueError: see `image.check_images`.
-            ScoreUnavailable: a side is shorter than `MIN_SIZE`.
+        ScoreUnavailable where a side is shorter than `MIN_SIZE`.
         """
         import torch
 
@@ -111,20 +101,8 @@ class LpipsDistance:
             return float(self.network(a, b))
 
 
-def lpips_distance(
-    backbone: Backbone = "alex",
-    weights_dir: Path | None = None,
-    *,
-    download: bool = True,
-) -> LpipsDistance:
-    """Load LPIPS. "alex" is the published score's classifier; "squeeze" has a score of its own, "vgg" is for protocols.
-
-    Args:
-        weights_dir, download: see `find_weights`.
-    Raises:
-        InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
-        ScoreUnavailable: lpips, torchvision or the weights are missing, with the reason.
-    """
+def lpips_distance(backbone: Backbone, weights_dir: Path | None = None, *, download: bool = True) -> LpipsDistance:
+    """Load LPIPS; "vgg" is for protocols. Arguments and errors as `find_weights`; also without the packages."""
     import_torchvision()
     found = find_weights(CLASSIFIERS[backbone], weights_dir, download=download)
     network, heads = _untrained(backbone)

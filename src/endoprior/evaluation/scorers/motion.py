@@ -13,55 +13,38 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
 from ...core.types import Frame
+from ...footage.components import Image, Mask
+from ...footage.optical_flow import MIN_SIZE_PX, dense_flow, gray_for_flow
 from ...model.colors import changes_color, with_fixed_color
 from ..context import NETWORKS_OFF, EvaluationContext, SceneFrames
 from ..networks import RAFT_LARGE, RAFT_SMALL, find_weights, import_torchvision, select_weights
-from ..score import Score, ScoreUnavailable
+from ..score import ScoreUnavailable, scores_from
 
 if TYPE_CHECKING:
     from torch.nn import Module
 
-DIS_MIN_SIZE = 32
-"""Shortest image side for DIS, px: a shorter one has no room for two levels of its 8 px patches."""
-RAFT_UPDATES = 12
-"""Refinements of RAFT's flow; the last one is used, as published."""
+RAFT_UPDATES = 12  # Refinements of RAFT's flow; the last one is used, as published
 RAFT_SIDE_MULTIPLE, RAFT_MIN_SIZE = 8, 128
 """Sides are padded to multiples of the first, px; below the second RAFT's coarsest level has no pixel left."""
-FlowEstimator = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32]]
+FlowEstimator = Callable[[Image, Image], NDArray[np.float32]]
 """Gives the (H, W, 2) displacement (x, y) in px from the first to the second of two (H, W, 3) 8-bit RGB images."""
-SCORES = (
-    Score(
-        "flow_error_dis", "flow error (DIS)", "px", False, 3,
-        "Difference of rendered and true optical flow between consecutive frames of the split, by OpenCV's DIS.",
-        group="motion", hint="0 moves as the video does",
-    ),
-    Score(
-        "flow_error", "flow error", "px", False, 3,
-        "The published one: the same by RAFT-large; needs its weights.",
-        group="motion", hint="0 moves as the video does",
-    ),
-    Score(
-        "flow_error_raft_small", "flow error (RAFT-small)", "px", False, 3,
-        "The same by RAFT-small, where its weights are on this machine.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "flow_error_dis_adjacent", "flow error, adjacent (DIS)", "px", False, 3,
-        "The same by DIS, between all adjacent frames of the video.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "color_share", "change by color", "", False, 3,
-        "Share of the change of rendered tissue over time that is lost when colors are fixed: motion does not make it.",
-        "absolute", group="motion", hint="0: all by motion; 1: nothing moves",
-    ),
-)  # fmt: skip
+SCORES = scores_from("""
+    flow_error_dis | flow error (DIS) | px | lower | 3 | relative | motion | 0 moves as the video does
+        Difference of rendered and true optical flow between consecutive frames of the split, by OpenCV's DIS.
+    flow_error | flow error | px | lower | 3 | relative | motion | 0 moves as the video does
+        The published one: the same by RAFT-large; needs its weights.
+    flow_error_raft_small | flow error (RAFT-small) | px | lower | 3 | relative | motion | -
+        The same by RAFT-small, where its weights are on this machine.
+    flow_error_dis_adjacent | flow error, adjacent (DIS) | px | lower | 3 | relative | motion | -
+        The same by DIS, between all adjacent frames of the video.
+    color_share | change by color |  | lower | 3 | absolute | motion | 0: all by motion; 1: nothing moves
+        Share of the change of rendered tissue over time that is lost when colors are fixed: motion does not make it.
+""")
 
 
 def compute(context: EvaluationContext) -> None:
@@ -84,7 +67,6 @@ def compute(context: EvaluationContext) -> None:
 
 def _add(context: EvaluationContext, name: str, frames: Sequence[Frame], estimator: FlowEstimator) -> None:
     """Add the mean error over pairs of neighbors in `frames`: over a test split they are 8 frames apart, as published.
-
     In `per_frame` a pair of the split stands at its first frame.
     """
     errors: list[float] = []
@@ -99,11 +81,7 @@ def _add(context: EvaluationContext, name: str, frames: Sequence[Frame], estimat
 
 
 def color_share(context: EvaluationContext) -> float:
-    """Share of the change in the rendered split that is color changing with time, in place of motion.
-
-    Raises:
-        ScoreUnavailable: the colors do not change, or nothing does.
-    """
+    """Share of the change in the rendered split that is color changing with time; ScoreUnavailable without change."""
     scene = context.scene
     if not changes_color(scene):
         raise ScoreUnavailable("the colors of this scene do not change with time")
@@ -120,38 +98,19 @@ def color_share(context: EvaluationContext) -> float:
     return float(by_color / change)
 
 
-def dis_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Dense inverse search (Kroeger et al. 2016) by OpenCV, medium preset, on gray images; see `FlowEstimator`.
-
-    The result is bit-identical for any number of OpenCV threads.
-
-    Raises:
-        ScoreUnavailable: a side is shorter than `DIS_MIN_SIZE`.
-    """
-    if min(first.shape[:2]) < DIS_MIN_SIZE:
+def dis_flow(first: Image, second: Image) -> NDArray[np.float32]:
+    """Dense inverse search on gray images; see `FlowEstimator`. ScoreUnavailable below `MIN_SIZE_PX`."""
+    if min(first.shape[:2]) < MIN_SIZE_PX:
         height, width = first.shape[:2]
-        raise ScoreUnavailable(f"DIS flow needs images of at least {DIS_MIN_SIZE} px a side; got {width}x{height}")
-    gray_first, gray_second = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second))
-    # A new estimator for each pair: its buffers would make a pair depend on the one before.
-    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return estimator.calc(gray_first, gray_second, None)
+        raise ScoreUnavailable(f"DIS flow needs images of at least {MIN_SIZE_PX} px a side; got {width}x{height}")
+    return dense_flow(gray_for_flow(first, 1), gray_for_flow(second, 1))
 
 
 def flow_error(
-    renders: Sequence[NDArray[np.uint8]],
-    targets: Sequence[NDArray[np.uint8]],
-    masks: Sequence[NDArray[np.bool_]],
-    estimator: FlowEstimator,
+    renders: Sequence[Image], targets: Sequence[Image], masks: Sequence[Mask], estimator: FlowEstimator
 ) -> float:
-    """Mean end-point distance between rendered and true flow of a pair of frames, px; NaN without common tissue.
-
-    All images are multiplied by their tissue mask first, and a pixel counts where both frames show tissue.
-
-    Args:
-        renders, targets: two rendered and two true images, (H, W, 3) 8-bit RGB.
-        masks: two tissue masks, (H, W) True = tissue.
-    Raises:
-        ScoreUnavailable: the estimator cannot work on images of this size.
+    """Mean end-point distance between rendered and true flow of a pair of frames (H, W, 3), px; NaN without common
+    tissue. All images are multiplied by their tissue mask first, and a pixel counts where both frames show tissue.
     """
     both = masks[0] & masks[1]
     if not both.any():
@@ -169,13 +128,8 @@ class RaftFlow:
 
     network: Module
 
-    def __call__(self, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Sides that are not a multiple of 8 are padded at the right and bottom by the last column and row.
-
-        Raises:
-            ValueError: shapes differ.
-            ScoreUnavailable: a side is shorter than `RAFT_MIN_SIZE`.
-        """
+    def __call__(self, first: Image, second: Image) -> NDArray[np.float32]:
+        """Sides that are not a multiple of 8 are padded at the right and bottom by the last column and row."""
         import torch
 
         size = check_shape("first:H,W,3 second:H,W,3", first=first, second=second)
@@ -191,19 +145,9 @@ class RaftFlow:
 
 
 def raft_flow(
-    variant: Literal["large", "small"] = "large",
-    weights_dir: Path | None = None,
-    *,
-    download: bool = True,
+    variant: Literal["large", "small"], weights_dir: Path | None = None, *, download: bool = True
 ) -> RaftFlow:
-    """Load RAFT. "large" is the published score's network; "small" has a score of its own.
-
-    Args:
-        weights_dir, download: see `find_weights`.
-    Raises:
-        InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
-        ScoreUnavailable: torchvision or the weights are missing, with the reason.
-    """
+    """Load RAFT. Arguments and errors as `find_weights`; ScoreUnavailable without torchvision."""
     import torch
 
     models = import_torchvision().models.optical_flow

@@ -2,7 +2,8 @@
 
 The true tracks either cover all frames, as on a phantom, or are two sets of unpaired points, those of the first frame
 and those of the last, as in STIR, which does not say which point became which. Scores of paired tracks stand beside
-the same scores of chained optical flow and of no motion. `T` frames, `P` points.
+the same scores of chained optical flow and of no motion. `T` frames, `P` points, which are in camera axes of their
+frame, mm; pixels in px of the frame.
 
 Delta_avg: Schmidt et al., "Point Tracking in Surgery: the 2024 Surgical Tattoos in Infrared (STIR) Challenge".
 Average Jaccard and occlusion accuracy: Doersch et al., "TAP-Vid: A Benchmark for Tracking Any Point in a Video".
@@ -11,125 +12,86 @@ Average Jaccard and occlusion accuracy: Doersch et al., "TAP-Vid: A Benchmark fo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
-from ...core.geometry import camera_to_world, cells_at
-from ...core.types import Frame
+from ...core.geometry import back_project, bilinear, camera_to_world, cells_at, project
+from ...core.types import Camera, Frame
 from ...data import FrameSequence, nearest_end_errors
+from ...footage.components import Image, distance_inside
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene
+from ...model.surface import project_visible, render_surface, shown_pixels
+from ...system.memory import workers
 from ..context import EvaluationContext
-from ..predicted_tracks import PredictedTracks, TrueTracks, by_chained_flow, by_scene, true_tracks, without_motion
-from ..score import Score
+from ..score import ScoreUnavailable, scores_from
 
-NEAR_TOOL_PX = 40
-"""Points within this distance of the tool mask are near the tool; px of an image 640 px wide."""
+NEAR_TOOL_PX = 40  # Points within this distance of the tool mask are near the tool; px of an image 640 px wide
 THRESHOLDS_PX = (4, 8, 16, 32, 64)
 """Distances within which a point counts as followed, px of the frame: those of STIR 2024."""
-NEIGHBORS = 4
-"""Nearest neighbors of each point whose connection is checked."""
-TEAR_STRETCH = 2.0
-"""A connection between neighbors that is this many times too long is torn."""
-END_ERROR = Score(
-    "track_end_error_mm", "track end error", "mm", False, 3,
-    "Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.",
-    group="motion", hint="0 follows the tissue",
-)  # fmt: skip
-ACCURACY = (
-    Score(
-        "track_error_mm", "track error", "mm", False, 3,
-        "Mean distance between carried and true points over all frames in which the point is visible.",
-        group="motion", hint="0 follows the tissue",
-    ),
-    Score(
-        "track_error_px", "track error", "px", False, 3,
-        "The same distance in the image.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "track_error_median_px", "track error, median", "px", False, 3,
-        "Median of that distance.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "track_error_p90_px", "track error, 90 %", "px", False, 3,
-        "90th percentile of that distance.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "track_error_after_hidden_mm", "seen again", "mm", False, 3,
-        "Track error where the point is visible again after at least one frame that hides it.",
-        group="motion", hint="tissue that was hidden before",
-    ),
-    Score(
-        "track_error_near_tool_mm", "track near tool", "mm", False, 3,
-        "Track error within 40 px of the tool mask, in px of an image 640 px wide.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "track_error_pulled_mm", "track, pulled", "mm", False, 3,
-        "Track error of points that move by at least half of a pull; phantoms with regions only.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "track_error_smooth_mm", "track, smooth", "mm", False, 3,
-        "Track error of other points on tissue with little texture; phantoms with regions only.",
-        group="motion", in_summary=False,
-    ),
-    Score(
-        "track_delta_avg", "delta_avg", "", True, 3,
-        "Share of visible points within 4, 8, 16, 32 and 64 px of the truth, mean of the five, as in STIR 2024.",
-        "absolute", group="motion", hint="1 follows the tissue",
-    ),
-    Score(
-        "track_average_jaccard", "average Jaccard", "", True, 3,
-        "TP / (TP + FP + FN) of position and visibility at these distances, mean of the five, as in TAP-Vid.",
-        "absolute", group="motion", hint="1: position and visibility right",
-    ),
-    Score(
-        "track_occlusion_accuracy", "occlusion accuracy", "", True, 3,
-        "Share of points whose visibility is predicted right, as in TAP-Vid.",
-        "absolute", group="motion", hint="1: visibility right",
-    ),
-)  # fmt: skip
+NEIGHBORS = 4  # Nearest neighbors of each point whose connection is checked
+TEAR_STRETCH = 2.0  # A connection between neighbors that is this many times too long is torn
+RETURN_PX, RETURN_SHARE = 1.0, 0.05
+"""Chained flow loses a point where flow and backward flow disagree by more than this, plus this share of the step."""
+FLOW_BYTES = 40  # Memory per pixel while the flow of a pair of frames is computed, bytes
+FLOW_CHUNK = 16  # Number of frame pairs whose flow is computed together
+TOO_SMALL = f"frames are smaller than {MIN_SIZE_PX} px, the least for optical flow"
+END_ERROR = scores_from("""
+    track_end_error_mm | track end error | mm | lower | 3 | relative | motion | 0 follows the tissue
+        Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.
+""")
+ACCURACY = scores_from("""
+    track_error_mm | track error | mm | lower | 3 | relative | motion | 0 follows the tissue
+        Mean distance between carried and true points over all frames in which the point is visible.
+    track_error_px | track error | px | lower | 3 | relative | motion | -
+        The same distance in the image.
+    track_error_median_px | track error, median | px | lower | 3 | relative | motion | -
+        Median of that distance.
+    track_error_p90_px | track error, 90 % | px | lower | 3 | relative | motion | -
+        90th percentile of that distance.
+    track_error_after_hidden_mm | seen again | mm | lower | 3 | relative | motion | tissue that was hidden before
+        Track error where the point is visible again after at least one frame that hides it.
+    track_error_near_tool_mm | track near tool | mm | lower | 3 | relative | motion | -
+        Track error within 40 px of the tool mask, in px of an image 640 px wide.
+    track_error_pulled_mm | track, pulled | mm | lower | 3 | relative | motion | -
+        Track error of points that move by at least half of a pull; phantoms with regions only.
+    track_error_smooth_mm | track, smooth | mm | lower | 3 | relative | motion | -
+        Track error of other points on tissue with little texture; phantoms with regions only.
+    track_delta_avg | delta_avg |  | higher | 3 | absolute | motion | 1 follows the tissue
+        Share of visible points within 4, 8, 16, 32 and 64 px of the truth, mean of the five, as in STIR 2024.
+    track_average_jaccard | average Jaccard |  | higher | 3 | absolute | motion | 1: position and visibility right
+        TP / (TP + FP + FN) of position and visibility at these distances, mean of the five, as in TAP-Vid.
+    track_occlusion_accuracy | occlusion accuracy |  | higher | 3 | absolute | motion | 1: visibility right
+        Share of points whose visibility is predicted right, as in TAP-Vid.
+""")
 """Scores that any prediction of tracks has."""
-BREAKS = (
-    Score(
-        "track_fold_rate", "folds", "", False, 4,
-        "Share of lines between a point and its nearest neighbors that point against the true line.",
-        "absolute", group="motion", hint="0: neighbors keep their order",
-    ),
-    Score(
-        "track_tear_rate", "tears", "", False, 4,
-        "Share of such lines that are more than twice as long as the true line.",
-        "absolute", group="motion", hint="0: neighbors stay together",
-    ),
-)  # fmt: skip
-REFERENCES = {"dis": "chained optical flow (DIS)", "still": "no motion"}
+BREAKS = scores_from("""
+    track_fold_rate | folds |  | lower | 4 | absolute | motion | 0: neighbors keep their order
+        Share of lines between a point and its nearest neighbors that point against the true line.
+    track_tear_rate | tears |  | lower | 4 | absolute | motion | 0: neighbors stay together
+        Share of such lines that are more than twice as long as the true line.
+""")
+REFERENCES = {"dis": ("flow", "chained optical flow (DIS)"), "still": ("no motion", "no motion")}
 """What stands beside the scene's scores, by the end of the name."""
-SCORES = (
-    END_ERROR,
-    *ACCURACY,
-    *BREAKS,
-    *(
-        replace(
-            score,
-            name=f"{score.name}_{end}",
-            label=f"{score.label}, {'flow' if end == 'dis' else 'no motion'}",
-            description=f"`{score.name}` of {what}.",
-            in_summary=False,
-            hint="",
-        )
-        for score in ACCURACY
-        for end, what in REFERENCES.items()
-    ),
+OF_REFERENCES = tuple(
+    replace(
+        score,
+        name=f"{score.name}_{end}",
+        label=f"{score.label}, {short}",
+        description=f"`{score.name}` of {what}.",
+        in_summary=False,
+        hint="",
+    )
+    for score in ACCURACY
+    for end, (short, what) in REFERENCES.items()
 )
+SCORES = END_ERROR + ACCURACY + BREAKS + OF_REFERENCES
 WHY_NOT = {
     "track_error_after_hidden_mm": "no point is hidden and seen again",
     "track_error_near_tool_mm": "no visible point is near a tool",
@@ -139,6 +101,39 @@ WHY_NOT = {
 NO_TRACKS = "no track is visible in two frames"
 NO_PAIRS = "no two neighbors are visible together"
 BEHIND = "a point is predicted behind the camera"
+
+
+@dataclass(frozen=True)
+class TrueTracks:
+    """Every true point that is visible in two frames."""
+
+    points: NDArray[np.float64]  # (T, P, 3) mm
+    pixels: NDArray[np.floating]  # (T, P, 2) px
+    visible: NDArray[np.bool_]  # (T, P) True where the point is seen
+    region: NDArray[np.str_] | None  # (P,) part of the tissue each point lies in, if the truth says so
+
+    @property
+    def first(self) -> NDArray[np.intp]:
+        """(P,) frame each point starts in: the first that shows it."""
+        return self.visible.argmax(0)
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """(T, P) True after the frame the point starts in."""
+        return np.arange(len(self.visible))[:, None] > self.first
+
+    def at_start(self, values: NDArray) -> NDArray:
+        """(P, ...) of (T, P, ...) values: those of the frame in which each point starts."""
+        return values[self.first, np.arange(values.shape[1])]
+
+
+@dataclass(frozen=True)
+class PredictedTracks:
+    """Positions of the same points by one method; only those after the frame a point starts in count."""
+
+    points: NDArray[np.floating]  # (T, P, 3) mm
+    pixels: NDArray[np.floating]  # (T, P, 2) px; infinite where the point is behind the camera
+    visible: NDArray[np.bool_]  # (T, P) whether the method says that the frame shows the point
 
 
 def compute(context: EvaluationContext) -> None:
@@ -174,21 +169,27 @@ def compute(context: EvaluationContext) -> None:
 def track_scores(
     predicted: PredictedTracks, true: TrueTracks, parts: Mapping[str, NDArray[np.bool_]]
 ) -> dict[str, float]:
-    """Every score of `ACCURACY` by name; NaN where nothing counts, infinite for predictions without an image.
+    """Every score of `ACCURACY` by name, with the `parts_of`; NaN where nothing counts, infinite without an image."""
 
-    Args:
-        parts: by `parts_of`.
-    """
+    def mean(values: NDArray[np.floating]) -> float:
+        return float(values.mean()) if len(values) else math.nan
+
+    def quantile(values: NDArray[np.floating], share: float) -> float:
+        """Linear between values as `np.quantile`, but infinite where one of the two is."""
+        with np.errstate(invalid="ignore"):
+            found = float(np.quantile(values, share)) if len(values) else math.nan
+        return math.inf if math.isnan(found) and len(values) else found
+
     visible = true.visible & true.counted
     # A hidden truth may lie behind the camera: its distance does not count.
     distance_px = np.linalg.norm(predicted.pixels - np.where(np.isfinite(true.pixels), true.pixels, 0), axis=-1)
     distance_mm = np.linalg.norm(predicted.points.astype(np.float64) - true.points, axis=-1)
     return {
-        "track_error_mm": _mean(distance_mm[visible]),
-        "track_error_px": _mean(distance_px[visible]),
-        "track_error_median_px": _quantile(distance_px[visible], 0.5),
-        "track_error_p90_px": _quantile(distance_px[visible], 0.9),
-        **{f"track_error_{part}_mm": _mean(distance_mm[visible & chosen]) for part, chosen in parts.items()},
+        "track_error_mm": mean(distance_mm[visible]),
+        "track_error_px": mean(distance_px[visible]),
+        "track_error_median_px": quantile(distance_px[visible], 0.5),
+        "track_error_p90_px": quantile(distance_px[visible], 0.9),
+        **{f"track_error_{part}_mm": mean(distance_mm[visible & chosen]) for part, chosen in parts.items()},
         **track_accuracy(distance_px, predicted.visible, true.visible, true.counted),
     }
 
@@ -199,16 +200,11 @@ def track_accuracy(
     visible: NDArray[np.bool_],
     counted: NDArray[np.bool_],
 ) -> dict[str, float]:
-    """Shares in [0, 1] by the name of the score, over every (frame, point) that counts; NaN where nothing does.
+    """Shares in [0, 1] by the name of the score, over every (T, P) frame and point that counts; NaN where nothing does.
 
     A point is a true positive if it is visible, predicted visible and near; a false positive if it is predicted
-    visible, but is hidden or far; a false negative if it is visible, but predicted hidden or far.
-
-    Args:
-        distance_px: (T, P) distance of predicted and true pixel; infinite where a prediction has no image. Where the
-            truth is hidden, it does not matter.
-        predicted_visible, visible: (T, P) prediction and truth.
-        counted: (T, P) True where a point counts: after the frame it starts in.
+    visible, but is hidden or far; a false negative if it is visible, but predicted hidden or far. The distance is
+    infinite where a prediction has no image; where the truth is hidden, it does not matter.
     """
     visible, predicted_visible = visible & counted, predicted_visible & counted
     if not visible.any():
@@ -230,20 +226,16 @@ def track_accuracy(
 def neighbor_breaks(
     predicted: NDArray, truth: NDArray, visible: NDArray[np.bool_], first: NDArray[np.integer]
 ) -> tuple[float, float]:
-    """Folds and tears between each point and its nearest neighbors that start in the same frame.
+    """Share of folds and of tears between points and their nearest neighbors that start in the same frame, or NaN.
 
-    Args:
-        predicted, truth: (T, P, 3) positions, mm. visible: (T, P) True where a point counts.
-        first: (P,) frame each point starts in; `truth` is known there.
-    Returns:
-        Share of (frame, pair), both ends of which count, in which the predicted connection points against the true one;
-        and in which it is more than `TEAR_STRETCH` times as long. NaN without any pair.
+    Of the (frame, pair) both ends of which are `visible`, (T, P): the predicted connection points against the true one;
+    it is more than `TEAR_STRETCH` times as long. The truth is known in the frame `first`, (P,).
     """
     folds = tears = total = 0
     for start in np.unique(first):
         group = np.flatnonzero(first == start)
         k = min(NEIGHBORS + 1, len(group))
-        _, nearest = cKDTree(truth[start, group]).query(truth[start, group], k=k)
+        _, nearest = KDTree(truth[start, group], leafsize=16).query(truth[start, group], k=k)
         a, b = np.repeat(group, k), group[np.reshape(nearest, -1)]
         a, b = np.unique(np.sort(np.stack([a, b]), 0)[:, a != b], axis=1)  # each pair once
         both = visible[:, a] & visible[:, b]
@@ -264,8 +256,7 @@ def parts_of(true: TrueTracks, sequence: FrameSequence) -> dict[str, NDArray[np.
 
 def seen_again(true: TrueTracks) -> NDArray[np.bool_]:
     """(T, P) where a point is visible, and was hidden in a frame since the one it starts in."""
-    hidden_before = np.logical_or.accumulate(true.counted & ~true.visible, axis=0)
-    return true.visible & hidden_before
+    return true.visible & np.logical_or.accumulate(true.counted & ~true.visible, axis=0)
 
 
 def near_tool(true: TrueTracks, sequence: FrameSequence) -> NDArray[np.bool_]:
@@ -274,33 +265,14 @@ def near_tool(true: TrueTracks, sequence: FrameSequence) -> NDArray[np.bool_]:
     for i, frame in enumerate(sequence.frames("video")):
         if not frame.tissue_mask.all():
             columns, rows = cells_at(true.pixels[i, true.visible[i]], frame.camera.width, frame.camera.height)
-            near[i, true.visible[i]] = _near_tool(frame)[rows, columns]
+            distance = distance_inside(frame.tissue_mask)[rows, columns]
+            near[i, true.visible[i]] = distance <= NEAR_TOOL_PX * frame.camera.width / 640
     return near
 
 
-def _near_tool(frame: Frame) -> NDArray[np.bool_]:
-    """(H, W) pixels within `NEAR_TOOL_PX` of the tool mask, which is not empty."""
-    distance = cv2.distanceTransform(frame.tissue_mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return distance <= NEAR_TOOL_PX * frame.camera.width / 640
-
-
-def _mean(values: NDArray[np.floating]) -> float:
-    return float(values.mean()) if len(values) else math.nan
-
-
-def _quantile(values: NDArray[np.floating], share: float) -> float:
-    """Linear between values as `np.quantile`, but infinite where one of the two is; NaN without values."""
-    if not len(values):
-        return math.nan
-    with np.errstate(invalid="ignore"):
-        found = float(np.quantile(values, share))
-    return math.inf if math.isnan(found) else found
-
-
 def track_end_error_mm(scene: Scene, sequence: FrameSequence) -> float:
-    """Mean distance of points carried from the first to the last frame to the nearest true point there, mm.
-
-    The error of STIR's benchmark, for tracks that are not paired; NaN if no point is known at start or end.
+    """Mean distance of points carried from the first to the last frame to the nearest true point there, mm: the error
+    of STIR's benchmark, for tracks that are not paired; NaN if no point is known at start or end.
     """
     tracks = sequence.truth and sequence.truth.tracks
     if not tracks or tracks.paired or not (tracks.visible[0].any() and tracks.visible[-1].any()):
@@ -312,3 +284,108 @@ def track_end_error_mm(scene: Scene, sequence: FrameSequence) -> float:
     last_time = (len(scene.cameras) - 1) / len(scene.cameras)
     carried = carry_points(scene, start, np.zeros(len(start), np.intp), [0.0, last_time])
     return float(nearest_end_errors(carried[1], ends).mean())
+
+
+def true_tracks(sequence: FrameSequence) -> TrueTracks | None:
+    """The paired tracks of the ground truth; None if there are none with two frames that show the same point."""
+    tracks = sequence.truth and sequence.truth.tracks
+    if not tracks or not tracks.paired:
+        return None
+    chosen = tracks.visible.sum(0) > 1
+    if not chosen.any():
+        return None
+    points = tracks.points[:, chosen].astype(np.float64)
+    pixels = np.stack([_pixels(p, sequence.camera(i)) for i, p in enumerate(points)])
+    region = None if tracks.region is None else tracks.region[chosen]
+    return TrueTracks(points, pixels, tracks.visible[:, chosen], region)
+
+
+def by_scene(scene: Scene, true: TrueTracks, sequence: FrameSequence) -> PredictedTracks:
+    """Points carried by the Gaussians; visible where neither rendered tissue nor the tool mask hides them."""
+    times = [i / len(sequence) for i in range(len(sequence))]
+    world = carry_points(scene, _world_starts(true, sequence), true.first, times)
+    tracks = _in_frames(world, sequence)
+    for i, frame in enumerate(sequence.frames("video")):
+        tracks.visible[i] &= project_visible(world[i], render_surface(scene, frame.time, frame.camera))[1]
+    return tracks
+
+
+def without_motion(true: TrueTracks, sequence: FrameSequence) -> PredictedTracks:
+    """Points that stay where they start; with a moving camera, where they start in the world."""
+    starts = _world_starts(true, sequence)
+    return _in_frames(np.broadcast_to(starts, (len(sequence), *starts.shape)), sequence)
+
+
+def by_chained_flow(true: TrueTracks, sequence: FrameSequence) -> PredictedTracks:
+    """Points moved from frame to frame by optical flow (DIS), held-out frames included; a lost point moves on too.
+
+    A point is visible in a frame unless it is outside of the image, under the tool mask, or the backward flow does not
+    return to where it came from. Its depth is the measured one at its pixel, else the last known one.
+    ScoreUnavailable where the frames are too small for optical flow.
+    """
+    frames = sequence.frames("video")
+    if min(sequence.camera(0).width, sequence.camera(0).height) < MIN_SIZE_PX:
+        raise ScoreUnavailable(TOO_SMALL)
+    first, depth = true.first, true.at_start(true.points)[:, 2]
+    pixels = np.tile(true.at_start(true.pixels), (len(sequence), 1, 1))
+    points, visible = np.tile(true.at_start(true.points), (len(sequence), 1, 1)), np.zeros_like(true.visible)
+    for k, (there, back) in enumerate(_flows(frames)):
+        frame, moving = frames[k + 1], first <= k
+        step = _flow_at(there, pixels[k], frame)
+        pixels[k + 1] = np.where(moving[:, None], pixels[k] + step, pixels[k])
+        gap = np.linalg.norm(step + _flow_at(back, pixels[k + 1], frame), axis=-1)
+        returns = gap <= RETURN_PX + RETURN_SHARE * np.linalg.norm(step, axis=-1)
+        shown = shown_pixels(pixels[k + 1], frame.tissue_mask)
+        x, y = cells_at(pixels[k + 1], frame.camera.width, frame.camera.height)
+        depth = np.where(moving & shown & frame.depth_valid[y, x], frame.depth[y, x], depth)
+        points[k + 1] = back_project(pixels[k + 1], depth, _at_origin(frame.camera))
+        visible[k + 1] = moving & shown & returns
+    return PredictedTracks(points, pixels, visible)
+
+
+def _in_frames(world: NDArray[np.floating], sequence: FrameSequence) -> PredictedTracks:
+    """World points (T, P, 3) as each frame's camera sees them, visible where the frame shows tissue."""
+    points, pixels, visible = [], [], []
+    for at, frame in zip(world, sequence.frames("video"), strict=True):
+        pose = frame.camera.world_to_camera
+        points.append(at @ pose[:3, :3].T + pose[:3, 3])
+        pixels.append(_pixels(points[-1], frame.camera))
+        visible.append(shown_pixels(pixels[-1], frame.tissue_mask))
+    return PredictedTracks(np.stack(points), np.stack(pixels), np.stack(visible))
+
+
+def _world_starts(true: TrueTracks, sequence: FrameSequence) -> NDArray[np.float64]:
+    """(P, 3) world position of each point in the frame it starts in, mm."""
+    to_world = camera_to_world(sequence.camera(i) for i in range(len(sequence)))[true.first]
+    return np.einsum("pij,pj->pi", to_world[:, :3, :3], true.at_start(true.points)) + to_world[:, :3, 3]
+
+
+def _at_origin(camera: Camera) -> Camera:
+    return replace(camera, world_to_camera=np.eye(4))
+
+
+def _pixels(points: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
+    """(P, 2) pixels of points in camera axes; infinite behind the camera."""
+    pixels, z = project(points, _at_origin(camera))
+    return np.where((z > 0)[:, None], pixels, np.inf)
+
+
+def _flow_at(flow: NDArray[np.float32], pixels: NDArray[np.floating], frame: Frame) -> NDArray[np.float64]:
+    """(P, 2) flow at pixels of the frame, in px of the frame; at a border beyond the image."""
+    scale = np.array([frame.camera.width / flow.shape[1], frame.camera.height / flow.shape[0]])
+    return bilinear(flow, pixels / scale) * scale
+
+
+def _flows(frames: Sequence[Frame]) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """The flows from frame k to k + 1 and back: the same fine flow from which training starts."""
+    camera = frames[0].camera
+    shrink = fine_shrink(camera.height, camera.width)
+
+    def pair(first: Image, second: Image) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return fine_flow(first, second), fine_flow(second, first)
+
+    with ThreadPoolExecutor(workers(FLOW_BYTES * camera.width * camera.height)) as pool:  # OpenCV releases the lock
+        for start in range(0, len(frames) - 1, FLOW_CHUNK):
+            chunk = range(start, min(start + FLOW_CHUNK + 1, len(frames)))
+            grays = [gray_for_flow(frames[k].rgb_u8, shrink) for k in chunk]
+            yield from pool.map(pair, grays[:-1], grays[1:])

@@ -30,15 +30,11 @@ function changed() {
   changedAt = performance.now();
 }
 
-function fail(text) {
-  byId("message").firstElementChild.textContent = text;
-  document.body.dataset.state = "failed";
-  stage.removeAttribute("aria-busy");
-}
-
 function failWith(error) {
   console.error(error);
-  fail(error.message);
+  byId("message").firstElementChild.textContent = error.message;
+  document.body.dataset.state = "failed";
+  stage.removeAttribute("aria-busy");
 }
 
 // ---- rendering
@@ -48,12 +44,8 @@ function layOut(share) {
   const { clientWidth: width, clientHeight: height } = stage;
   const { scale } = fit();
   const [w, h] = state.free ? [width, height] : [Math.round(about.width * scale), Math.round(about.height * scale)];
-  Object.assign(canvas.style, {
-    width: `${w}px`,
-    height: `${h}px`,
-    left: `${Math.floor((width - w) / 2)}px`,
-    top: `${Math.floor((height - h) / 2)}px`,
-  });
+  const place = { width: w, height: h, left: Math.floor((width - w) / 2), top: Math.floor((height - h) / 2) };
+  for (const [name, length] of Object.entries(place)) canvas.style[name] = `${length}px`;
   const density = share * Math.min(window.devicePixelRatio || 1, MOST_PIXELS_PER_PIXEL / scale);
   const buffer = [w, h].map((length) => Math.max(1, Math.round(length * density)));
   if (canvas.width !== buffer[0]) canvas.width = buffer[0];
@@ -149,10 +141,7 @@ function tellWhere() {
 function sway(seconds) {
   if (swayedFor === Infinity) return;
   swayedFor += Math.min(seconds, LONGEST_STEP);
-  if (swayedFor >= SWAY.turns * SWAY.period) {
-    endSway();
-    return;
-  }
+  if (swayedFor >= SWAY.turns * SWAY.period) return endSway();
   document.body.dataset.sway = "on";
   swaying.yaw = SWAY.angle * Math.sin((2 * Math.PI * swayedFor) / SWAY.period);
   stale = true;
@@ -179,11 +168,6 @@ function setDepth(depth) {
   state.depth = depth;
   byId("depth").setAttribute("aria-pressed", depth);
   byId("scale").hidden = !depth;
-  changed();
-}
-
-function resetView() {
-  hand.reset();
   changed();
 }
 
@@ -231,10 +215,8 @@ function onUp(event) {
 
 function onWheel(event) {
   event.preventDefault();
-  if (!state.free) setFree(true);
   const lines = event.deltaMode === 1 ? 30 : 1;
-  hand.approach(Math.exp(Math.max(-200, Math.min(200, event.deltaY * lines)) * 0.0015));
-  changed();
+  zoom(Math.exp(Math.max(-200, Math.min(200, event.deltaY * lines)) * 0.0015));
 }
 
 // ---- keys
@@ -249,7 +231,7 @@ const KEYS = {
   f: () => setFree(true),
   d: () => setDepth(!state.depth),
   l: () => setLoop(!state.loop),
-  r: resetView,
+  r: () => hand.reset(),
   "+": () => zoom(0.9),
   "=": () => zoom(0.9),
   "-": () => zoom(1 / 0.9),
@@ -297,7 +279,7 @@ function connect() {
     endoscope: () => setFree(false),
     free: () => setFree(true),
     depth: () => setDepth(!state.depth),
-    reset: resetView,
+    reset: () => { hand.reset(); changed(); },
   };
   for (const [id, act] of Object.entries(clicks)) {
     byId(id).addEventListener("click", (event) => {

@@ -19,30 +19,23 @@ from scipy.sparse.linalg import splu
 
 NEAREST_MM = 1e-3
 """Points nearer than this, or behind the camera, are held at it: finite residuals, far from any inlier."""
-TRACK_WIDTH = (1.5, 6.0)
-"""Range of the width of a track's weight, standard deviations; between them twice the median over the tracks."""
-SINGLE_WIDTH = 4.0
-"""Width of the weight of one observation, standard deviations."""
-DEPTH_WIDTH = 3.0
-"""Width of the weight of one depth, standard deviations."""
-DENSE_LIMIT = 900
-"""Up to this many unknowns of the cameras, their system is solved as a dense matrix."""
-INLIER_PX = 2.5
-"""Largest reprojection error of an inlier of RANSAC, px of an image 640 px wide."""
-FEWEST = 12
-"""With fewer points there is no pose."""
+TRACK_WIDTH = (1.5, 6.0)  # least and largest width of a track's weight; between them twice the median of the tracks
+SINGLE_WIDTH = 4.0  # width of the weight of one observation, standard deviations
+DEPTH_WIDTH = 3.0  # width of the weight of one depth, standard deviations
+DENSE_LIMIT = 900  # up to this many unknowns of the cameras, their system is solved as a dense matrix
+INLIER_PX = 2.5  # largest reprojection error of an inlier of RANSAC, px of an image 640 px wide
+FEWEST = 12  # with fewer points there is no pose
 
 
 def residuals(
     matrix: NDArray, poses: NDArray, points: NDArray, pixels: NDArray, inverse_depth: NDArray, sigma: NDArray
-) -> NDArray[np.float64]:
+) -> NDArray:
     """(N, 3) standardized residuals: u, v, and inverse depth 1/z (Eq.: disparity = f b / z).
 
     Args:
         matrix: (3, 3) K, px.
         poses: (N, 4, 4) or (4, 4) world-to-camera.
-        points: (N, 3) world points, mm.
-        pixels: (N, 2) where they were seen, px.
+        points: (N, 3) world points, mm, which were seen at `pixels`: (N, 2).
         inverse_depth: (N,) 1 / measured depth, 1/mm.
         sigma: (N, 2) standard deviation of a pixel, px, and of the inverse depth, 1/mm; inf where none was measured.
     """
@@ -53,9 +46,7 @@ def residuals(
     return np.stack([u / sigma[:, 0], v / sigma[:, 0], (1 / z - inverse_depth) / sigma[:, 1]], 1)
 
 
-def derivatives(
-    matrix: NDArray, poses: NDArray, points: NDArray, sigma: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def derivatives(matrix: NDArray, poses: NDArray, points: NDArray, sigma: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Derivatives of `residuals`: (N, 3, 6) by the pose step (w, v), (N, 3, 3) by the point, (N, 3) by log f."""
     seen = _in_camera(poses, points)
     x, y = seen[:, 0], seen[:, 1]
@@ -70,7 +61,7 @@ def derivatives(
     return by_pose, by_seen @ poses[..., :3, :3], by_focal
 
 
-def moved(poses: NDArray, steps: NDArray) -> NDArray[np.float64]:
+def moved(poses: NDArray, steps: NDArray) -> NDArray:
     """(K, 4, 4) poses after steps (K, 6) of rotation, rad, and translation, mm, in camera axes."""
     out = poses.copy()
     for k, step in enumerate(steps):
@@ -80,14 +71,14 @@ def moved(poses: NDArray, steps: NDArray) -> NDArray[np.float64]:
     return out
 
 
-def back_projected(matrix: NDArray, pose: NDArray, pixels: NDArray, z: NDArray) -> NDArray[np.float64]:
+def back_projected(matrix: NDArray, pose: NDArray, pixels: NDArray, z: NDArray) -> NDArray:
     """(N, 3) world points of pixels (N, 2) at depth z (N,) mm, seen from a world-to-camera pose."""
     x = (pixels[:, 0] - matrix[0, 2]) / matrix[0, 0] * z
     y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1] * z
     return (np.stack([x, y, z], 1) - pose[:3, 3]) @ pose[:3, :3]
 
 
-def _in_camera(poses: NDArray, points: NDArray) -> NDArray[np.float64]:
+def _in_camera(poses: NDArray, points: NDArray) -> NDArray:
     return (poses[..., :3, :3] @ points[:, :, None])[:, :, 0] + poses[..., :3, 3]
 
 
@@ -95,47 +86,34 @@ def _in_camera(poses: NDArray, points: NDArray) -> NDArray[np.float64]:
 class Observations:
     """Which camera saw which point where."""
 
-    camera: NDArray[np.intp]
-    """(N,) 0..K-1."""
-    point: NDArray[np.intp]
-    """(N,) 0..P-1."""
-    pixels: NDArray[np.float64]
-    """(N, 2) px."""
-    inverse_depth: NDArray[np.float64]
-    """(N,) 1 / measured depth, 1/mm; anything finite where its sigma is inf."""
-    sigma: NDArray[np.float64]
-    """(N, 2) standard deviations: px, 1/mm."""
+    camera: NDArray  # (N,) 0..K-1
+    point: NDArray  # (N,) 0..P-1
+    pixels: NDArray  # (N, 2) px
+    inverse_depth: NDArray  # (N,) 1 / measured depth, 1/mm; anything finite where its sigma is inf
+    sigma: NDArray  # (N, 2) standard deviations: px, 1/mm
 
 
 @dataclass(frozen=True)
 class Adjusted:
     """Result of the adjustment."""
 
-    poses: NDArray[np.float64]
-    """(K, 4, 4) world-to-camera."""
-    points: NDArray[np.float64]
-    """(P, 3) mm."""
-    track_weight: NDArray[np.float64]
-    """(P,) 0..1: how well the track follows the rigid scene over time."""
-    focal_factor: float
-    """Of the focal length; 1 where it is fixed."""
-    focal_std: float
-    """Standard deviation of its logarithm; 0 where it is fixed."""
+    poses: NDArray  # (K, 4, 4) world-to-camera
+    points: NDArray  # (P, 3) mm
+    track_weight: NDArray  # (P,) 0..1: how well the track follows the rigid scene over time
+    focal_factor: float  # of the focal length; 1 where it is fixed
+    focal_std: float  # standard deviation of its logarithm; 0 where it is fixed
 
 
 def adjust(
     matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, fixed: NDArray[np.bool_], *,
     rounds: int = 4, steps: int = 2, focal_prior: float = 0.0, widest: float = 1.0,
 ) -> Adjusted:  # fmt: skip
-    """Adjust poses and points to what was seen.
+    """Adjust poses (K, 4, 4) world-to-camera and points (P, 3), mm, to what was seen.
 
     Args:
         matrix: (3, 3) K, px.
-        poses: (K, 4, 4) world-to-camera.
-        points: (P, 3) mm.
         fixed: (K,) cameras that stay; at least one, or the world drifts.
-        rounds: updates of the weights.
-        steps: Levenberg-Marquardt steps after each update.
+        rounds, steps: updates of the weights, and Levenberg-Marquardt steps after each.
         focal_prior: standard deviation of log f; 0 keeps the focal length.
         widest: the widths of the weights start at this multiple and halve with each round: a path that drifted has
             large residuals where it returns, and they must not count as moving tissue.
@@ -160,14 +138,12 @@ def adjust(
     return Adjusted(poses, points, track, float(np.exp(log_f)), focal_std)
 
 
-def geman_mcclure(squared: NDArray, width: float) -> NDArray[np.float64]:
+def geman_mcclure(squared: NDArray, width: float) -> NDArray:
     """Weight in (0, 1] of residuals with these squares: (c^2 / (c^2 + r^2))^2."""
     return (width * width / (width * width + squared)) ** 2
 
 
-def weights(
-    error: NDArray, point: NDArray, count: int, wider: float = 1.0
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def weights(error: NDArray, point: NDArray, count: int, wider: float = 1.0) -> tuple[NDArray, NDArray]:
     """Weights (N, 3) of standardized residuals (N, 3), and (count,) of the tracks they belong to.
 
     The width of the track weight follows the data: where more than half of the tissue moves, rigid is what moves least.
@@ -183,13 +159,12 @@ def weights(
     return _weights(error, track[point], max(wider * SINGLE_WIDTH, 1.5 * width), wider * DEPTH_WIDTH), track
 
 
-def _weights(error: NDArray, track: NDArray, width: float, depth_width: float = DEPTH_WIDTH) -> NDArray[np.float64]:
-    """(N, 3) weights of residuals whose tracks have these weights (N,)."""
+def _weights(error: NDArray, track: NDArray, width: float, depth_width: float = DEPTH_WIDTH) -> NDArray:
     pixel = track * geman_mcclure((error[:, :2] ** 2).sum(1), width)
     return np.stack([pixel, pixel, track * geman_mcclure(error[:, 2] ** 2, depth_width)], 1)
 
 
-def _error(matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, log_f: float) -> NDArray[np.float64]:
+def _error(matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, log_f: float) -> NDArray:
     here = poses[seen.camera], points[seen.point]
     return residuals(_scaled(matrix, log_f), *here, seen.pixels, seen.inverse_depth, seen.sigma)
 
@@ -198,7 +173,7 @@ def _cost(error: NDArray, weight: NDArray, log_f: float, focal_prior: float) -> 
     return float((weight * error**2).sum()) + ((log_f / focal_prior) ** 2 if focal_prior else 0.0)
 
 
-def _scaled(matrix: NDArray, log_f: float) -> NDArray[np.float64]:
+def _scaled(matrix: NDArray, log_f: float) -> NDArray:
     out = np.array(matrix, np.float64)
     out[[0, 1], [0, 1]] *= np.exp(log_f)
     return out
@@ -237,7 +212,7 @@ class _System:
             self.of_cameras = self.of_cameras + prior
             self.camera_gradient[-1] += log_f / focal_prior**2
 
-    def solve(self, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    def solve(self, damping: float) -> tuple[NDArray, NDArray, float]:
         """Steps of the poses (K, 6), of the points (P, 3) and of log f."""
         inverse = self._inverse(damping)
         right = self.camera_gradient - self.mixed @ (inverse @ self.point_gradient)
@@ -260,19 +235,19 @@ class _System:
         reduced = self._reduced(self._inverse(1e-9), 1e-9)
         return float(np.sqrt(max(splu(reduced.tocsc()).solve(unit)[-1], 0.0)))
 
-    def _inverse(self, damping: float) -> sparse.csr_matrix:
+    def _inverse(self, damping: float) -> sparse.csr_array:
         count = len(self.of_points)
         diagonal = np.einsum("nii->ni", self.of_points)
         least = 1e-9 * (1 + diagonal.max(1, keepdims=True))
         blocks = self.of_points + (damping * diagonal + least)[:, :, None] * np.eye(3)
         return sparse.bsr_matrix((np.linalg.inv(blocks), np.arange(count), np.arange(count + 1))).tocsr()
 
-    def _reduced(self, inverse: sparse.csr_matrix, damping: float) -> sparse.csr_matrix:
+    def _reduced(self, inverse: sparse.csr_array, damping: float) -> sparse.csr_array:
         held = sparse.diags(self.of_cameras.diagonal() * damping + 1e-9)
         return self.of_cameras + held - self.mixed @ inverse @ self.mixed.T
 
 
-def summed_by(point: NDArray[np.intp], values: NDArray, count: int) -> NDArray[np.float64]:
+def summed_by(point: NDArray, values: NDArray, count: int) -> NDArray:
     """(count, ...) sums over the observations of each point, of values (N, ...)."""
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     sums = [np.bincount(point, weights=column, minlength=count) for column in flat.T]
@@ -290,19 +265,15 @@ def _rows(values: NDArray, columns: NDArray, width: int) -> sparse.csr_matrix:
 class Resected:
     """A pose and how sure it is."""
 
-    pose: NDArray[np.float64]
-    """(4, 4) world-to-camera."""
-    inlier: NDArray[np.bool_]
-    """(N,) points that it explains."""
-    translation_std: float
-    """Of the camera center, mm; the points count as known."""
-    rotation_std: float
-    """rad."""
+    pose: NDArray  # (4, 4) world-to-camera
+    inlier: NDArray[np.bool_]  # (N,) points that it explains
+    translation_std: float  # of the camera center, mm; the points count as known
+    rotation_std: float  # rad
 
 
 def coarse_pose(
     matrix: NDArray, points: NDArray, pixels: NDArray, guess: NDArray | None, inlier_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+) -> tuple[NDArray, NDArray] | None:
     """World-to-camera (4, 4) by perspective-n-point with RANSAC, and (N,) its inliers; None if there is none."""
     if len(points) < FEWEST:
         return None
@@ -316,47 +287,36 @@ def coarse_pose(
     )  # fmt: skip
     if not done or found is None or len(found) < FEWEST or not np.isfinite(turn).all():
         return None
-    inlier = np.zeros(len(points), bool)
-    inlier[found.ravel()] = True
-    pose = np.eye(4)
+    inlier, pose = np.isin(np.arange(len(points)), found), np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     return pose, inlier
 
 
 def refined_pose(
     matrix: NDArray, pose: NDArray, points: NDArray, pixels: NDArray, inverse_depth: NDArray, sigma: NDArray,
-    track_weight: NDArray, *, steps: int = 8, widest: float = 4.0,
+    track_weight: NDArray,
 ) -> Resected:  # fmt: skip
-    """Refine a pose; residuals in standard deviations are weighted by their track and by Geman-McClure.
+    """Refine a pose; residuals in standard deviations are weighted by their track, (N,), and by Geman-McClure."""
 
-    Args:
-        sigma: (N, 2) px and 1/mm, as in `residuals`.
-        track_weight: (N,) 0..1.
-        widest: the weight's width starts at this multiple of its final one, and halves with each step.
-    """
-    for step in range(steps):
-        width = SINGLE_WIDTH * max(1.0, widest / 2**step)
+    def linearized(pose: NDArray, width: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Residuals, their weights, normal matrix and gradient."""
         error = residuals(matrix, pose, points, pixels, inverse_depth, sigma)
         weight = _weights(error, track_weight, width)
-        normal, gradient = _normal(matrix, pose, points, sigma, error, weight)
+        by_pose = derivatives(matrix, pose, points, sigma)[0].reshape(-1, 6)
+        weighted = by_pose * weight.reshape(-1, 1)
+        return error, weight, weighted.T @ by_pose, weighted.T @ error.ravel()
+
+    for wider in (4.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
+        width = SINGLE_WIDTH * wider
+        _, _, normal, gradient = linearized(pose, width)
         change = -np.linalg.solve(normal + np.diag(1e-6 * np.diag(normal) + 1e-9), gradient)
         pose = moved(pose[None], change[None])[0]
         if width == SINGLE_WIDTH and np.abs(change).max() < 1e-7:
             break
-    error = residuals(matrix, pose, points, pixels, inverse_depth, sigma)
+    error, weight, normal, _ = linearized(pose, SINGLE_WIDTH)
     squared = (error[:, :2] ** 2).sum(1)
-    weight = _weights(error, track_weight, SINGLE_WIDTH)
-    normal, _ = _normal(matrix, pose, points, sigma, error, weight)
     # The residuals themselves say how large the errors are: the tracker's vary from clip to clip.
     variance = float((weight[:, 0] * squared).sum() / max(2 * weight[:, 0].sum() - 6, 1))
     covariance = np.linalg.inv(normal + 1e-9 * np.eye(6)) * variance
     spread = np.sqrt(np.maximum([np.trace(covariance[3:, 3:]), np.trace(covariance[:3, :3])], 0))
     return Resected(pose, squared < SINGLE_WIDTH**2, float(spread[0]), float(spread[1]))
-
-
-def _normal(
-    matrix: NDArray, pose: NDArray, points: NDArray, sigma: NDArray, error: NDArray, weight: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    by_pose = derivatives(matrix, pose, points, sigma)[0].reshape(-1, 6)
-    weighted = by_pose * weight.reshape(-1, 1)
-    return weighted.T @ by_pose, weighted.T @ error.ravel()

@@ -19,56 +19,42 @@ from scipy import sparse
 from .adjust import Observations, derivatives, moved, residuals, summed_by, weights
 from .follow import Follower
 
-HARMONICS = 2
-CYCLES = 3.0
-"""Fewer breaths are not told from the camera."""
-SHORTEST = 8
-"""Frames of the fastest breath."""
-SAMPLE = 4000
-"""Observations from which the period is found."""
-SPACING = 12
-"""Frames of a breath that are adjusted, and ..."""
-MOST_CAMERAS = 220
-"""... at most in all: a longer clip is left to the camera."""
-SIGNIFICANT = 0.03
-"""Share of the residuals that one period must explain ..."""
-PEAK = 10.0
-"""... and how many times more than the median period."""
-SMOOTH = 20.0
-"""Weight of the acceleration of the camera, 1/mm; rotation counts at the distance of the tissue."""
-STILL_MM = 0.01
-"""Changes of speed far below this count quadratically, mm per step."""
-COEFFICIENT_MM = 5.0
-"""Prior standard deviation of A and B, mm."""
+HARMONICS, ROUNDS = 2, 8
+CYCLES = 3.0  # fewer breaths are not told from the camera
+SHORTEST = 8  # frames of the fastest breath
+SAMPLE = 4000  # observations from which the period is found
+SPACING = 12  # frames of a breath that are adjusted, and ...
+MOST_CAMERAS = 220  # ... at most in all: a longer clip is left to the camera
+SIGNIFICANT = 0.03  # share of the residuals that one period must explain ...
+PEAK = 10.0  # ... and how many times more than the median period
+SMOOTH = 20.0  # weight of the acceleration of the camera, 1/mm; rotation counts at the distance of the tissue
+STILL_MM = 0.01  # changes of speed far below this count quadratically, mm per step
+COEFFICIENT_MM = 5.0  # prior standard deviation of A and B, mm
 
 
 @dataclass(frozen=True)
 class Breathing:
     """Displacement of every point in every frame."""
 
-    period: float
-    """Frames."""
-    basis: NDArray[np.float64]
-    """(P, 6) phi of each point."""
-    coefficients: NDArray[np.float64]
-    """(6, 2 * HARMONICS, 3) mm."""
+    period: float  # frames
+    basis: NDArray  # (P, 6) phi of each point
+    coefficients: NDArray  # (6, 2 * HARMONICS, 3) mm
 
-    def at(self, frame: int, ids: NDArray) -> NDArray[np.float64]:
+    def at(self, frame: int, ids: NDArray) -> NDArray:
         """(N, 3) displacement of points, mm."""
         wave = waves(np.array([frame]), self.period)[0]
         return self.basis[ids] @ np.einsum("bhj,h->bj", self.coefficients, wave)
 
 
-def waves(frames: NDArray, period: float) -> NDArray[np.float64]:
+def waves(frames: NDArray, period: float) -> NDArray:
     """(N, 2 * HARMONICS) cosines and sines of the frames."""
     angle = 2 * np.pi * np.asarray(frames, np.float64)[:, None] / period * np.arange(1, HARMONICS + 1)
     return np.concatenate([np.cos(angle), np.sin(angle)], 1)
 
 
-def surface_basis(points: NDArray) -> NDArray[np.float64]:
+def surface_basis(points: NDArray) -> NDArray:
     """(P, 6) 1, a, b, a^2, a b, b^2 of the place of each point (P, 3) along the tissue, about 1 in size."""
-    middle = np.median(points, 0)
-    spread = points - middle
+    spread = points - np.median(points, 0)
     size = np.maximum(np.median(np.linalg.norm(spread, axis=1)), 1e-9)
     kept = spread[np.linalg.norm(spread, axis=1) < 4 * size]
     axes = np.linalg.svd(kept, full_matrices=False)[2][:2]
@@ -127,9 +113,8 @@ def breathing_period(
     """The period, frames, at which residuals (N, 3) repeat; None if none stands out.
 
     Args:
-        error, by_point, weight: residuals, their derivative by the point (N, 3, 3), and weights (N, 3).
-        basis: (N, B) of the place of each observation.
-        frames: (N,) frame of each observation.
+        by_point, weight: derivative of the residuals by the point, (N, 3, 3), and their weights (N, 3).
+        basis: (N, B) of the place of each observation, in `frames`: (N,).
         count: frames of the clip.
     """
     frequencies = np.arange(CYCLES / count, 1 / SHORTEST, 0.5 / count)
@@ -158,16 +143,10 @@ def breathing_period(
 
 
 def separate(
-    matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, frames: NDArray, period: float, *,
-    rounds: int = 8,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    """Adjust cameras, points and periodic motion together.
+    matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, frames: NDArray, period: float
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Adjust cameras (K, 4, 4), of frames (K,), points (P, 3) and motion of this period together.
 
-    Args:
-        poses: (K, 4, 4) world-to-camera.
-        points: (P, 3) mm.
-        frames: (K,) their numbers.
-        period: of a breath, frames.
     Returns:
         Poses, points, coefficients (6, 2 * HARMONICS, 3) mm, and weights of the tracks (P,).
     """
@@ -176,16 +155,14 @@ def separate(
     coefficients = np.zeros((basis.shape[1], wave.shape[1], 3))
     distance = float(np.median(1 / seen.inverse_depth))
     track = np.ones(len(points))
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         swing = np.einsum("nb,nh->nbh", basis[seen.point], wave[seen.camera])
         here = points[seen.point] + np.einsum("nbh,bhj->nj", swing, coefficients)
         error = residuals(matrix, poses[seen.camera], here, seen.pixels, seen.inverse_depth, seen.sigma)
         weight, track = weights(error, seen.point, len(points))
-        root = np.sqrt(weight)
+        root, cameras, size = np.sqrt(weight), 6 * len(poses), 6 * len(poses) + coefficients.size
         by_pose, by_point, _ = derivatives(matrix, poses[seen.camera], here, seen.sigma)
         by_pose, by_point, error = by_pose * root[..., None], by_point * root[..., None], error * root
-        cameras = 6 * len(poses)
-        size = cameras + coefficients.size
         normal, gradient, mixed = _normal_equations(by_pose, by_point, error, seen, basis, wave)
         _add_smoothness(normal, gradient, poses, frames, distance)
         normal[range(cameras, size), range(cameras, size)] += COEFFICIENT_MM**-2
@@ -200,7 +177,7 @@ def separate(
 
 def _normal_equations(
     by_pose: NDArray, by_point: NDArray, error: NDArray, seen: Observations, basis: NDArray, wave: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray, NDArray, NDArray]:
     """Normal matrix and gradient of cameras (6 K) and coefficients, and their products with the points (size, P, 3).
 
     The derivative by a coefficient is that by the point times basis (of the point) times wave (of the camera): sums
@@ -212,7 +189,7 @@ def _normal_equations(
     b, harmonics = basis[seen.point], wave.shape[1]
     shared = b.shape[1] * harmonics * 3
 
-    def by_camera(*factors: NDArray) -> NDArray[np.float64]:
+    def by_camera(*factors: NDArray) -> NDArray:
         """Sums over the observations of each camera of products of (N, ...) arrays."""
         product = factors[0].reshape(count, -1)
         for factor in factors[1:]:
@@ -242,7 +219,8 @@ def _normal_equations(
         np.einsum("kjb,kh->bhj", by_camera(pull, b).reshape(cameras, 3, -1), wave).ravel(),
     ])  # fmt: skip
     mixed = np.zeros((6 * cameras + shared, points, 3))
-    np.add.at(mixed[: 6 * cameras].reshape(cameras, 6, points, 3), (seen.camera, slice(None), seen.point), across)
+    places = seen.camera[:, None], np.arange(6), seen.point[:, None]
+    np.add.at(mixed[: 6 * cameras].reshape(cameras, 6, points, 3), places, across)
     swung = inner.reshape(count, 9, 1) * wave[seen.camera][:, None]
     swung = (of_point @ swung.reshape(count, -1)).reshape(points, 3, 3, harmonics)
     mixed[6 * cameras :] = np.einsum("pb,pjih->bhjpi", basis, swung).reshape(shared, points, 3)
@@ -251,7 +229,7 @@ def _normal_equations(
 
 def _solve(
     normal: NDArray, gradient: NDArray, mixed: NDArray, by_point: NDArray, error: NDArray, point: NDArray, count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray, NDArray]:
     """Steps of cameras and coefficients, and of the points (P, 3), which are eliminated."""
     own = summed_by(point, np.einsum("nij,nik->njk", by_point, by_point), count)
     pull = summed_by(point, np.einsum("nij,ni->nj", by_point, error), count)

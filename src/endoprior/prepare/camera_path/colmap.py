@@ -27,35 +27,20 @@ from .follow import Follower
 from .own import finished_path, place_frames
 from .tracks import CameraPath, PoseInput, Tracks
 
-ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4
-"""A longer clip is mapped by every second to fourth frame; our tracks place those between."""
-LONGEST = 1000
-"""Longer clips are mapped only if COLMAP is asked for: it takes seconds a frame."""
-DEFORMING = 0.1
-"""Tracks below this weight deform; the tissue around them is masked ..."""
-AROUND = 40
-"""... within the image width divided by this."""
-SECONDS_AN_IMAGE = 1.0
-"""About the time for each image, on two cores. Mapping that alone takes longer is stopped: see `time_note`."""
-LEAST_SECONDS = 60
-"""Mapping may always take this long."""
-LEAST_SHARE = 0.3
-"""A model with a smaller share of the frames is no path of the clip."""
-PARALLAX = 0.02
-"""Least spread of the rays to a point, rad, whose position counts for the scale."""
-FEWEST = 10
-"""With fewer such points in a frame, its scale is that of the frames around."""
-STRIDE = 3
-"""Points are placed by every third frame and all keyframes: neighbors add nothing."""
+ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4  # a longer clip is mapped by every second to fourth frame
+LONGEST = 1000  # longer clips are mapped only if COLMAP is asked for: it takes seconds a frame
+DEFORMING = 0.1  # tracks below this weight deform; the tissue around them is masked ...
+AROUND = 40  # ... within the image width divided by this
+SECONDS_AN_IMAGE = 1.0  # about the time on two cores. Mapping that alone takes longer is stopped: see `time_note`.
+LEAST_SECONDS = 60  # mapping may always take this long
+LEAST_SHARE = 0.3  # a model with a smaller share of the frames is no path of the clip
+PARALLAX = 0.02  # least spread of the rays to a point, rad, whose position counts for the scale
+FEWEST = 10  # with fewer such points in a frame, its scale is that of the frames around
+STRIDE = 3  # points are placed by every third frame and all keyframes: neighbors add nothing
 
 
 def time_note(seconds: float, limit: float) -> list[str]:
-    """A note for the user if mapping was stopped, because the path then depends on the speed of the machine.
-
-    Args:
-        seconds: that it took.
-        limit: after which COLMAP stops it, s.
-    """
+    """A note for the user if mapping was stopped, because the path then depends on the speed of the machine."""
     if seconds < limit:
         return []
     return [f"COLMAP was stopped after {limit:.0f} s: a faster machine may find another path; `--poses own` does not"]
@@ -66,67 +51,48 @@ def is_installed() -> bool:
     return find_spec("pycolmap") is not None
 
 
-def stride_of(count: int) -> int:
-    """Every how many frames of a clip one is mapped."""
-    return min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
-
-
-def colmap_poses(
-    frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], float, list[str]] | None:
-    """World-to-camera poses (T, 4, 4) in units of its own, (T,) which frames are registered, focal factor, notes.
-
-    None if no model holds enough frames.
-    """
-    import pycolmap
-
-    stride = stride_of(count)
-    pycolmap.logging.minloglevel = 2
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for i in range(0, count, stride):
-            seen = frame(i)
-            save_png(_file(folder, "images", i), seen.rgb_u8)
-            save_png(_file(folder, "masks", i, ".png"), _allowed(seen, follower, i).astype(np.uint8) * 255)
-        models, notes = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
-    if not models:
-        return None
-    best = max(models.values(), key=lambda model: model.num_reg_images())
-    if best.num_reg_images() < max(LEAST_SHARE * len(range(0, count, stride)), 3):
-        return None
-    poses, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
-    for image in best.images.values():
-        if image.has_pose:
-            index = int(Path(image.name).stem)
-            poses[index, :3], known[index] = image.cam_from_world().matrix(), True
-    focal = next(iter(best.cameras.values())).params[0]
-    return poses, known, float(focal / follower.lens.matrix[0, 0]), notes
-
-
 def colmap_path(
     frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
 ) -> CameraPath | None:
-    """The path by COLMAP, in the unit of our depth; None if it finds none.
+    """The path by COLMAP, in the unit of our depth; None if no model holds enough frames.
 
     Args:
         frame: reads frame i.
         follower: our own tracks, their points adjusted: they show what deforms, and fill in frames.
         refine_focal: the focal length is an assumption; the factor of the path is relative to that of `follower`.
     """
-    found = colmap_poses(frame, count, follower, refine_focal=refine_focal)
-    if found is None:
+    import pycolmap
+
+    stride = min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
+    pycolmap.logging.minloglevel = 2
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for part in ("images", "masks", "models"):
+            (folder / part).mkdir()
+        for i in range(0, count, stride):
+            seen = frame(i)
+            save_png(folder / f"images/{i:06d}.png", seen.rgb_u8)
+            save_png(folder / f"masks/{i:06d}.png.png", _allowed(seen, follower, i).astype(np.uint8) * 255)
+        models, notes = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
+    best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    if best is None or best.num_reg_images() < max(LEAST_SHARE * len(range(0, count, stride)), 3):
         return None
-    poses, known, focal_factor, notes = found
-    unit = float(np.exp(np.median(np.log(with_poses(follower, poses, known, focal_factor).scales[known]))))
+    poses, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
+    for image in best.images.values():
+        if image.has_pose:
+            index = int(Path(image.name).stem)
+            poses[index, :3], known[index] = image.cam_from_world().matrix(), True
+    factor = float(next(iter(best.cameras.values())).params[0] / follower.lens.matrix[0, 0])
+    unit = float(np.exp(np.median(np.log(with_poses(follower, poses, known, factor).scales[known]))))
     poses[:, :3, 3] /= unit
-    world = with_poses(follower, poses, known, focal_factor)
+    world = with_poses(follower, poses, known, factor)
     if not world.lens.depth_is_relative:
         world.scales[:] = 1.0
     explained = known | (follower.segment == follower.segment[np.argmax(known)])
     stds = place_frames(world, np.flatnonzero(known), follower.poses, explained)
     explained = known | (explained & np.isfinite(stds[0]))
     path = finished_path(world, explained, *stds)
-    return replace(path, method=COLMAP_POSES, focal_factor=focal_factor, notes=notes)
+    return replace(path, method=COLMAP_POSES, focal_factor=factor, notes=notes)
 
 
 def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: bool) -> tuple[dict[int, Any], list[str]]:
@@ -134,9 +100,7 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     database = folder / "database.db"
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model, reader.mask_path = "PINHOLE", folder / "masks"
-    reader.camera_params = ",".join(
-        str(v) for v in (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
-    )
+    reader.camera_params = ",".join(map(str, (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)))
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = 2000
     extraction.sift.peak_threshold = 0.003
@@ -148,14 +112,10 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     mapping.max_num_models = 2
     limit = int(max(LEAST_SECONDS, SECONDS_AN_IMAGE * len(list((folder / "images").iterdir()))))
     mapping.max_runtime_seconds = limit
-    (folder / "models").mkdir()
-    device = pycolmap.Device.cpu
-    single = pycolmap.CameraMode.SINGLE
+    device, single = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
+    options = {"reader_options": reader, "extraction_options": extraction, "device": device}
     pycolmap.set_random_seed(0)
-    pycolmap.extract_features(
-        database, folder / "images", camera_mode=single, reader_options=reader, extraction_options=extraction,
-        device=device,
-    )  # fmt: skip
+    pycolmap.extract_features(database, folder / "images", camera_mode=single, **options)
     pycolmap.match_sequential(database, device=device)
     began = clock.perf_counter()
     models = pycolmap.incremental_mapping(database, folder / "images", folder / "models", mapping)
@@ -171,20 +131,11 @@ def _allowed(seen: PoseInput, follower: Follower, index: int) -> NDArray[np.bool
     return mask.astype(bool)
 
 
-def _file(folder: Path, part: str, index: int, more: str = "") -> Path:
-    path = folder / part / f"{index:06d}.png{more}"
-    path.parent.mkdir(exist_ok=True)
-    return path
-
-
-def with_poses(
-    follower: Follower, poses: NDArray[np.float64], known: NDArray[np.bool_], focal_factor: float = 1.0
-) -> Follower:
-    """A copy of the tracks whose points lie where these poses see them, with the depth scale of each frame.
+def with_poses(follower: Follower, poses: NDArray, known: NDArray[np.bool_], focal_factor: float = 1.0) -> Follower:
+    """A copy of the tracks whose points lie where poses (T, 4, 4) see them, with the depth scale of each frame.
 
     Args:
-        poses: (T, 4, 4) world-to-camera.
-        known: (T,) frames that have one.
+        known: (T,) frames that have a pose.
     """
     out = copy.copy(follower)
     tracks = out.tracks = follower.tracks.copy()
@@ -216,9 +167,7 @@ def with_poses(
     return out
 
 
-def ray_points(
-    tracks: Tracks, poses: NDArray[np.float64], known: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ray_points(tracks: Tracks, poses: NDArray, known: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
     """(P, 3) point nearest to all rays of each track, and (P,) the spread of the rays, rad; 0 with less than two rays.
 
     The point minimizes sum |(I - d d^T) (X - c)|^2 over rays with center c and direction d.

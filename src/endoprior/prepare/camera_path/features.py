@@ -17,47 +17,33 @@ from .adjust import back_projected, coarse_pose
 from .tracks import Lens, PoseInput
 
 MAX_CORNERS = 500
-REFRESH = 0.8
-"""New corners are detected when fewer than this share of `MAX_CORNERS` is left."""
-EDGE_STEP = 0.05
-"""No corners where depth changes by more than this share between neighbors: those are depth edges."""
-CELLS = (8, 6)
-"""The image is divided into these columns and rows; no cell holds more than twice its share of the corners."""
-FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0
-"""Shading is what is left after a blur by the image width divided by this; contrast of the rest, gray levels."""
-COARSE_HALVINGS, FINE_HALVINGS = 4, 1
-"""How often images are halved to follow corners: plain images, then flat ones."""
+REFRESH = 0.8  # new corners are detected when fewer than this share of `MAX_CORNERS` is left
+EDGE_STEP = 0.05  # no corners where depth changes by more than this share between neighbors: those are depth edges
+CELLS = (8, 6)  # columns and rows of the image; no cell holds more than twice its share of the corners
+FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0  # shading is left by a blur of width / 64 px; contrast of the rest, gray levels
+COARSE_HALVINGS, FINE_HALVINGS = 4, 1  # how often images are halved to follow corners: plain images, then flat ones
 FINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
-FINE_PX = 2.0
-"""The two results differ by less than this."""
-RETURN_PX = 1.0
-"""Followed to the next frame and back, a corner returns within this distance."""
+FINE_PX = 2.0  # the two results differ by less than this
+RETURN_PX = 1.0  # followed to the next frame and back, a corner returns within this distance
 KEYPOINTS = 600
-RATIO = 0.8
-"""The best match is nearer than the second best by this factor (Lowe's ratio test)."""
-FEWEST_INLIERS = 20
-"""Fewer matches that one pose explains may be chance."""
-INLIER_PX = 4.0
-"""Reprojection error of a match, px of an image 640 px wide: the tissue may have moved in between."""
+RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
+FEWEST_INLIERS = 20  # fewer matches that one pose explains may be chance
+INLIER_PX = 4.0  # reprojection error of a match, px of an image 640 px wide: the tissue may have moved in between
 
 
 @dataclass(frozen=True)
 class View:
     """A frame as points are recognized in it."""
 
-    plain: NDArray[np.uint8]
-    """(H, W) brightness: finds large motion."""
-    flat: NDArray[np.uint8]
-    """(H, W) without shading: the light moves with the camera, and what it paints must not count as tissue."""
-    usable: NDArray[np.bool_]
-    """(H, W) see `usable_tissue`."""
-    depth: NDArray[np.float32]
-    """(H, W) 0 where missing."""
+    plain: NDArray[np.uint8]  # (H, W) brightness: finds large motion
+    flat: NDArray[np.uint8]  # (H, W) without shading: what the light paints moves with the camera
+    usable: NDArray[np.bool_]  # (H, W) see `usable_tissue`
+    depth: NDArray[np.float32]  # (H, W) 0 where missing
 
 
 def view_of(seen: PoseInput) -> View:
     """Prepare a frame."""
-    plain = cv2.cvtColor(seen.rgb_u8, cv2.COLOR_RGB2GRAY)
+    plain = np.asarray(cv2.cvtColor(seen.rgb_u8, cv2.COLOR_RGB2GRAY), np.uint8)
     bright = np.log(plain.astype(np.float32) + 8)
     bright -= cv2.GaussianBlur(bright, (0, 0), max(plain.shape[1] / FLAT_WIDTHS, 2.0))
     flat = np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8)
@@ -71,11 +57,12 @@ def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
     small = cv2.resize(seen.rgb_u8, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
     glint = (specular_likelihood(small * np.float32(1 / 255)) > 0.5).astype(np.uint8)
     glint = cv2.resize(cv2.dilate(glint, np.ones((3, 3))), (width, height), interpolation=cv2.INTER_NEAREST)
-    tissue, border = seen.tissue_mask.astype(np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
-    return (cv2.erode(tissue, np.ones((7, 7)), **border) & (1 - glint)).astype(bool)
+    tissue = seen.tissue_mask.astype(np.uint8)
+    inner = cv2.erode(tissue, np.ones((7, 7)), borderType=cv2.BORDER_CONSTANT, borderValue=(0,))
+    return (inner & (1 - glint)).astype(bool)
 
 
-def new_corners(view: View, taken: NDArray[np.float32]) -> NDArray[np.float32]:
+def new_corners(view: View, taken: NDArray[np.float32]) -> NDArray:
     """(N, 2) corners on smooth tissue with depth, away from those `taken` (M, 2); none if these are enough."""
     if len(taken) >= REFRESH * MAX_CORNERS:
         return np.zeros((0, 2), np.float32)
@@ -104,7 +91,7 @@ def _cells(pixels: NDArray, width: int, height: int) -> NDArray[np.intp]:
     return np.clip((pixels[:, 1] * CELLS[1] / height).astype(int), 0, CELLS[1] - 1) * CELLS[0] + column
 
 
-def followed(before: View, now: View, pixels: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+def followed(before: View, now: View, pixels: NDArray) -> tuple[NDArray, NDArray]:
     """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
@@ -131,34 +118,26 @@ class Keyframe:
     """What is kept of a keyframe."""
 
     frame: int
-    pixels: NDArray[np.float32]
-    """(M, 2) px."""
-    depths: NDArray[np.float32]
-    """(M,) mm before any scale, > 0."""
-    descriptors: NDArray[np.uint8]
-    """(M, 128)."""
-    track: NDArray[np.int32]
-    """(M,) id of the track of the keypoint, -1 without one."""
+    pixels: NDArray[np.float32]  # (M, 2) px
+    depths: NDArray[np.float32]  # (M,) mm before any scale, > 0
+    descriptors: NDArray[np.uint8]  # (M, 128)
+    track: NDArray[np.int32]  # (M,) id of the track of the keypoint, -1 without one
 
 
 @dataclass(frozen=True)
 class Link:
     """A keyframe recognized in another one."""
 
-    pose: NDArray[np.float64]
-    """(4, 4) world-to-camera of the new one, in the world of the old one."""
-    old: NDArray[np.intp]
-    """(N,) keypoints of the old one ..."""
-    new: NDArray[np.intp]
-    """... that are these of the new one."""
-    scale: float
-    """Depth in the world of the old one, as a multiple of the new one's own depth."""
+    pose: NDArray  # (4, 4) world-to-camera of the new one, in the world of the old one
+    old: NDArray[np.intp]  # (N,) keypoints of the old one ...
+    new: NDArray[np.intp]  # ... that are these of the new one
+    scale: float  # depth in the world of the old one, as a multiple of the new one's own depth
 
 
 def keyframe(index: int, view: View) -> Keyframe:
     """Describe a frame by its SIFT keypoints on tissue with depth."""
     mask = (view.usable & (view.depth > 0)).astype(np.uint8)
-    found, descriptors = cv2.SIFT_create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(view.plain, mask)
+    found, descriptors = cv2.SIFT.create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(view.plain, mask)
     if descriptors is None:
         found, descriptors = (), np.zeros((0, 128), np.float32)
     pixels = np.array([point.pt for point in found], np.float32).reshape(-1, 2)
@@ -170,7 +149,7 @@ def keyframe(index: int, view: View) -> Keyframe:
 
 def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe) -> Link | None:
     """Find the pose of `new` from what it shares with `old`; None if that is too little."""
-    first, second = _matches(old.descriptors, new.descriptors)
+    first, second = _matches(old.descriptors.astype(np.float32), new.descriptors.astype(np.float32))
     if len(first) < FEWEST_INLIERS:
         return None
     points = back_projected(lens.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
@@ -185,11 +164,10 @@ def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Ke
     return Link(pose, first[inlier], second[inlier], scale)
 
 
-def _matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _matches(a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     """Mutual nearest neighbors that pass the ratio test."""
-    if len(first) < 2 or len(second) < 2:
+    if min(len(a), len(b)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    a, b = first.astype(np.float32), second.astype(np.float32)
     distance = (a**2).sum(1)[:, None] + (b**2).sum(1)[None] - 2 * a @ b.T
     best = np.argmin(distance, 1)
     two = np.partition(distance, 1, 1)[:, :2]

@@ -16,20 +16,14 @@ from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
 from .features import Keyframe, Link, View, followed, keyframe, link, new_corners, sampled, view_of
 from .tracks import Lens, PoseInput, Tracks
 
-MIN_TRACKS = 30
-"""With fewer tracks a frame gets no pose from the frame before."""
+MIN_TRACKS = 30  # with fewer tracks a frame gets no pose from the frame before
 MIN_INLIERS = 0.4
 """Share of the tracks that one pose must explain; below, the frame shows another place or another scene."""
-KEYFRAME_GAP = 10
-"""Frames from one keyframe to the next at most: the weights need the history of a breath ..."""
-KEYFRAME_LEFT = 0.7
-"""... and earlier when less than this share of its tracks is left ..."""
-KEYFRAME_SHIFT = 0.08
-"""... or when they have moved by this share of the image width."""
-WINDOW = 8
-"""Keyframes that are adjusted together with each new one."""
-RECENT, OLDER = 6, 14
-"""Keyframes that a lost frame is compared with: the last ones, and others spread over the clip."""
+KEYFRAME_GAP = 10  # frames from one keyframe to the next at most: the weights need the history of a breath ...
+KEYFRAME_LEFT = 0.7  # ... and earlier when less than this share of its tracks is left ...
+KEYFRAME_SHIFT = 0.08  # ... or when they have moved by this share of the image width
+WINDOW = 8  # keyframes that are adjusted together with each new one
+RECENT, OLDER = 6, 14  # keyframes that a lost frame is compared with: the last ones, and others spread over the clip
 
 
 class Follower:
@@ -38,8 +32,7 @@ class Follower:
     def __init__(self, lens: Lens, count: int) -> None:
         """Args: lens: the camera. count: frames of the clip."""
         self.lens, self.tracks = lens, Tracks(lens)
-        self.poses = np.tile(np.eye(4), (count, 1, 1))
-        """(T, 4, 4) world-to-camera, in the world of the frame's segment."""
+        self.poses = np.tile(np.eye(4), (count, 1, 1))  # (T, 4, 4) world-to-camera, in the world of the frame's segment
         self.scales = np.ones(count)
         self.segment = np.full(count, -1)
         self.keyframes: list[Keyframe] = []
@@ -49,16 +42,15 @@ class Follower:
 
     def follow(self, index: int, seen: PoseInput) -> None:
         """Add the next frame."""
-        view, lost = view_of(seen), True
-        if self._view is not None:
-            kept, pixels = followed(self._view, view, self._pixels)
-            depths = sampled(view.depth, pixels).astype(np.float32)
-            lost = not self._find_pose(index, self._ids[kept], self._pixels[kept], pixels, depths)
+        view, before, lost, depths = view_of(seen), self._view, True, np.zeros(0, np.float32)
+        if before is not None:
+            kept, pixels = followed(before, view, self._pixels)
+            measured = sampled(view.depth, pixels).astype(np.float32)
+            lost = not self._find_pose(index, before, self._ids[kept], self._pixels[kept], pixels, measured)
             if not lost:
-                self._ids, self._pixels = self._ids[kept], pixels
+                self._ids, self._pixels, depths = self._ids[kept], pixels, measured
         if lost:
             self._start_segment(index)
-            depths = np.zeros(0, np.float32)
         self._view = view
         self.tracks.see(index, self._ids, self._pixels, depths)
         if lost or self._keyframe_is_due(index):
@@ -67,7 +59,9 @@ class Follower:
         if self.keyframes[-1].frame == index:
             self._at_keyframe = self._ids, self._pixels
 
-    def _find_pose(self, index: int, ids: NDArray, before: NDArray, pixels: NDArray, depths: NDArray) -> bool:
+    def _find_pose(
+        self, index: int, last_view: View, ids: NDArray, before: NDArray, pixels: NDArray, depths: NDArray
+    ) -> bool:
         """Set pose and scale of a frame from its tracks; False if nothing rigid explains them."""
         tracks, lens = self.tracks, self.lens
         if len(ids) < MIN_TRACKS:
@@ -83,7 +77,7 @@ class Follower:
             pose, inlier = (fine.pose, fine.inlier) if fine.inlier.sum() >= 0.7 * found[1].sum() else found
         else:
             # Tissue that breathes leaves the place where it was first seen; from one frame to the next it moves little.
-            z = sampled(self._view.depth, before) * self.scales[index - 1]
+            z = sampled(last_view.depth, before) * self.scales[index - 1]
             there = z > 0
             points = back_projected(lens.matrix, last, before[there].astype(np.float64), z[there])
             found = coarse_pose(lens.matrix, points, pixels[there], last, limit)
@@ -99,8 +93,8 @@ class Follower:
         """Set the factor of a frame's depth by its rigid points, of those that are usable (P,)."""
         ids = self.tracks.ids[frame]
         good = usable[ids] & (self.tracks.weight[ids] > 0.3)
-        found = self._scale(self.poses[frame], ids[good], self.tracks.depths[frame][good], self.scales[frame])
-        self.scales[frame] = found
+        depths = self.tracks.depths[frame][good]
+        self.scales[frame] = self._scale(self.poses[frame], ids[good], depths, self.scales[frame])
 
     def _scale(self, pose: NDArray, ids: NDArray, depths: NDArray, otherwise: float) -> float:
         """Median ratio of the points' z to the measured depth; 1 where depth has a unit."""
@@ -117,14 +111,12 @@ class Follower:
         elif index and (self.segment == self.segment[index - 1]).sum() == 1:
             self.keyframes.pop()  # a single frame that nothing recognizes
         self._ids, self._pixels = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
-        self.poses[index], self.scales[index] = np.eye(4), 1.0
-        self.segment[index] = index
+        self.poses[index], self.scales[index], self.segment[index] = np.eye(4), 1.0, index
 
     def _keyframe_is_due(self, index: int) -> bool:
-        last = self.keyframes[-1].frame
         ids, pixels = self._at_keyframe
         kept, now, then = np.intersect1d(self._ids, ids, return_indices=True)
-        if index - last >= KEYFRAME_GAP or len(kept) < KEYFRAME_LEFT * len(ids):
+        if index - self.keyframes[-1].frame >= KEYFRAME_GAP or len(kept) < KEYFRAME_LEFT * len(ids):
             return True
         shift = np.hypot(*(self._pixels[now] - pixels[then]).T)
         return bool(np.median(shift) > KEYFRAME_SHIFT * 640 * self.lens.px)
@@ -133,16 +125,13 @@ class Follower:
         """Describe the frame in `self._view`, link its segment if it stands alone, adjust the last keyframes."""
         assert self._view is not None
         new = keyframe(index, self._view)
-        segment = self.segment[index]
-        others = [old for old in self.keyframes if self.segment[old.frame] != segment]
+        others = [old for old in self.keyframes if self.segment[old.frame] != self.segment[index]]
         self.keyframes.append(new)
-        if others:
-            tried = [*others[-RECENT:], *(others[i] for i in spread(max(len(others) - RECENT, 0), OLDER))]
-            links = [(link(self.lens, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried]
-            found = [(each, old) for each, old in links if each is not None]
-            if found:
-                best, old = max(found, key=lambda pair: len(pair[0].old))
-                self._move_segment(index, best, int(self.segment[old.frame]))
+        tried = [*others[-RECENT:], *(others[i] for i in spread(max(len(others) - RECENT, 0), OLDER))]
+        links = [(link(self.lens, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried]
+        if found := [(each, old) for each, old in links if each is not None]:
+            best, old = max(found, key=lambda pair: len(pair[0].old))
+            self._move_segment(index, best, int(self.segment[old.frame]))
         self._adjust_last()
 
     def _move_segment(self, index: int, found: Link, target: int) -> None:
@@ -163,18 +152,17 @@ class Follower:
 
     def _adjust_last(self) -> None:
         """Adjust the last keyframes of the segment and their points; the oldest of them hold the world."""
-        segment = self.segment[self.keyframes[-1].frame]
+        segment, tracks = self.segment[self.keyframes[-1].frame], self.tracks
         frames = [k.frame for k in self.keyframes if self.segment[k.frame] == segment][-WINDOW:]
         if len(frames) < 3:
             return
-        ids, seen = self.tracks.of_frames(frames, self.scales)
+        ids, seen = tracks.of_frames(frames, self.scales)
         if len(ids) < MIN_TRACKS:
             return
         fixed = np.arange(len(frames)) < (2 if len(frames) > 3 else 1)
-        done = adjust(self.lens.matrix, self.poses[frames], self.tracks.points[ids], seen, fixed, rounds=2, steps=1)
+        done = adjust(self.lens.matrix, self.poses[frames], tracks.points[ids], seen, fixed, rounds=2, steps=1)
         if not np.isfinite(done.poses).all():
             return
-        tracks = self.tracks
         self.poses[frames], tracks.points[ids], tracks.weight[ids] = done.poses, done.points, done.track_weight
         for frame in frames:
             self.set_scale(frame, np.ones(len(tracks.weight), bool))
@@ -191,7 +179,7 @@ class Follower:
 
 
 def follow_camera(
-    frame: Callable[[int], PoseInput], count: int, lens: Lens, progress: Callable[[int], None] = lambda done: None
+    frame: Callable[[int], PoseInput], count: int, lens: Lens, progress: Callable[[int], None] = lambda _done: None
 ) -> Follower:
     """Follow the camera through frames 0..count-1, each read once, in order."""
     follower = Follower(lens, count)

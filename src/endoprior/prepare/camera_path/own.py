@@ -19,26 +19,18 @@ from .features import Keyframe, link
 from .follow import Follower, follow_camera
 from .tracks import CameraPath, Lens, PoseInput, Tracks
 
-FOCAL_PRIOR = 0.2
-"""Standard deviation of log f where the focal length is assumed."""
-FOCAL_STD = 0.03
-"""A refined focal length is kept if the standard deviation of its logarithm is below this."""
+FOCAL_PRIOR = 0.2  # standard deviation of log f where the focal length is assumed
+FOCAL_STD = 0.03  # a refined focal length is kept if the standard deviation of its logarithm is below this
 BREATHES, NOT_CAMERA = "the tissue breathes", "what the view does in this rhythm is not counted as camera motion"
-MIN_POINTS = 20
-"""With fewer adjusted points a frame keeps its pose relative to its keyframe."""
-OVERLAP = 0.3
-"""Least share of an old keyframe's points that lies in the new image."""
-SHARED = 0.3
-"""Keyframes that share more of their tracks than this need no loop."""
-PARTNERS = 3
-"""Old keyframes that each new one is matched with at most."""
+MIN_POINTS = 20  # with fewer adjusted points a frame keeps its pose relative to its keyframe
+OVERLAP = 0.3  # least share of an old keyframe's points that lies in the new image
+SHARED = 0.3  # keyframes that share more of their tracks than this need no loop
+PARTNERS = 3  # old keyframes that each new one is matched with at most
 LOW_PX, HIGH_PX = 0.25, 0.5
 """The camera rests while rigid tissue stays this near to where it was, px of an image 640 px wide; once at rest, it
 moves when it is beyond the second value (hysteresis)."""
-FEWEST_FRAMES = 8
-"""A shorter rest is none: slow motion looks the same."""
-RIGID = 0.5
-"""Weight of a track that counts as rigid tissue."""
+FEWEST_FRAMES = 8  # a shorter rest is none: slow motion looks the same
+RIGID = 0.5  # weight of a track that counts as rigid tissue
 FEWEST_TRACKS = 20
 
 
@@ -49,15 +41,14 @@ def own_path(
     size: tuple[int, int],
     *,
     refine_focal: bool = False,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda _done: None,
 ) -> tuple[CameraPath, Follower]:
     """The path, and the tracks it comes from. Each frame is read once, in order. Args: as `choose.find_path`."""
     follower = follow_camera(frame, count, lens, progress)
     labels, frames = np.unique(follower.segment, return_counts=True)
     explained = follower.segment == labels[np.argmax(frames)]
     keyframes = sorted((k for k in follower.keyframes if explained[k.frame]), key=lambda k: k.frame)
-    followed_poses = follower.poses.copy()
-    focal_factor = 1.0
+    followed_poses, focal_factor = follower.poses.copy(), 1.0
     if len(keyframes) > 1:
         close_loops(follower, keyframes, size)
         focal_factor = _adjust_all(follower, keyframes, refine_focal)
@@ -74,18 +65,15 @@ def own_path(
 def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: bool) -> float:
     """Adjust all keyframes at once; returns the refined focal length as a multiple of the given one."""
     tracks, frames = follower.tracks, [k.frame for k in keyframes]
-    fixed = np.arange(len(frames)) == 0
-    factor = 1.0
+    fixed, factor = np.arange(len(frames)) == 0, 1.0
     for turn in range(4 if refine_focal else 3):
         ids, seen = tracks.of_frames(frames, follower.scales)
         if not len(ids):
             return factor
-        prior = FOCAL_PRIOR if refine_focal and turn else 0.0
-        matrix = follower.lens.matrix
-        first = turn == 0
+        prior, (rounds, widest) = FOCAL_PRIOR if refine_focal and turn else 0.0, (3, 1.0) if turn else (5, 16.0)
         done = adjust(
-            matrix, follower.poses[frames], tracks.points[ids], seen, fixed,
-            rounds=5 if first else 3, steps=2, focal_prior=prior, widest=16.0 if first else 1.0,
+            follower.lens.matrix, follower.poses[frames], tracks.points[ids], seen, fixed,
+            rounds=rounds, steps=2, focal_prior=prior, widest=widest,
         )  # fmt: skip
         if not np.isfinite(done.poses).all():
             return factor
@@ -103,12 +91,8 @@ def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: boo
 
 
 def place_frames(
-    follower: Follower,
-    starts: NDArray[np.intp],
-    followed: NDArray[np.float64],
-    explained: NDArray[np.bool_],
-    breathing: Breathing | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    follower: Follower, starts: NDArray, followed: NDArray, explained: NDArray, breathing: Breathing | None = None
+) -> tuple[NDArray, NDArray]:
     """Set the pose of every frame from the adjusted points; standard deviations of translation, mm, and rotation, rad.
 
     Args:
@@ -117,7 +101,7 @@ def place_frames(
     """
     tracks = follower.tracks
     stds = np.full((2, len(explained)), np.nan)
-    for f in np.flatnonzero(explained) if len(starts) else ():
+    for f in np.flatnonzero(explained).tolist() if len(starts) else ():
         at = starts[max(np.searchsorted(starts, f, "right") - 1, 0)]
         if f not in starts:
             follower.poses[f] = followed[f] @ np.linalg.inv(followed[at]) @ follower.poses[at]
@@ -126,7 +110,7 @@ def place_frames(
         if used.sum() < MIN_POINTS:
             continue
         ids, pixels, depths = ids[used], pixels[used].astype(np.float64), depths[used]
-        points = tracks.points[ids] if breathing is None else tracks.points[ids] + breathing.at(int(f), ids)
+        points = tracks.points[ids] if breathing is None else tracks.points[ids] + breathing.at(f, ids)
         found = tracks.refined(follower.poses[f], ids, points, pixels, depths)
         if not np.isfinite(found.pose).all():
             continue
@@ -138,12 +122,11 @@ def place_frames(
 
 
 def finished_path(
-    follower: Follower, explained: NDArray[np.bool_], translation_std: NDArray, rotation_std: NDArray
+    follower: Follower, explained: NDArray, translation_std: NDArray, rotation_std: NDArray
 ) -> CameraPath:
     """The path with rests copied, gaps filled, and the first explained frame at the origin."""
     poses, scales, count = np.linalg.inv(follower.poses), follower.scales.copy(), len(explained)
-    spans = resting(follower.tracks, explained)
-    still = np.zeros(count, bool)
+    spans, still = resting(follower.tracks, explained), np.zeros(count, bool)
     for first, last in spans:
         poses[first : last + 1] = poses[(first + last) // 2]
         still[first : last + 1] = True
@@ -161,13 +144,8 @@ def finished_path(
 
 
 def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, int]) -> None:
-    """Match keyframes of one world with older ones of the same place; matched keypoints become tracks.
-
-    Args:
-        size: (width, height) of the images, px.
-    """
-    tracks, lens = follower.tracks, follower.lens
-    poses, scales = follower.poses, follower.scales
+    """Match keyframes of one world with older ones of the same place; matched keypoints become tracks."""
+    tracks, lens, poses, scales = follower.tracks, follower.lens, follower.poses, follower.scales
     points = [
         back_projected(lens.matrix, poses[k.frame], k.pixels.astype(np.float64), k.depths * scales[k.frame])
         for k in keyframes
@@ -189,14 +167,10 @@ def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, 
                 continue
             fresh = old.track[match.old] < 0
             old.track[match.old[fresh]] = tracks.add_points(points[a][match.old[fresh]], keypoint=True)
-            _see(follower, old, match.old[fresh])
             unseen = new.track[match.new] < 0
             new.track[match.new[unseen]] = old.track[match.old[unseen]]
-            _see(follower, new, match.new[unseen])
-
-
-def _see(follower: Follower, key: Keyframe, which: NDArray[np.intp]) -> None:
-    follower.tracks.see(key.frame, key.track[which], key.pixels[which], key.depths[which])
+            for key, which in ((old, match.old[fresh]), (new, match.new[unseen])):
+                tracks.see(key.frame, key.track[which], key.pixels[which], key.depths[which])
 
 
 def _share_inside(matrix: NDArray, pose: NDArray, points: NDArray, size: tuple[int, int]) -> float:

@@ -21,29 +21,38 @@ HINT = "Write (T, 4, 4) camera-to-world matrices in mm, OpenCV axes."
 TEXT_SUFFIXES = (".txt", ".tum", ".freiburg", ".csv")
 TEXT_HINT = "Write `frame x y z qx qy qz qw` in each row: camera to world, m."
 MM_PER_M = 1000.0
-FARTHEST_M = 2.0
-"""An endoscope does not move further; larger numbers are mm."""
-UNIT_TOLERANCE = 0.01
-"""Largest difference of a quaternion's length from 1 that rounding explains."""
+FARTHEST_M = 2.0  # an endoscope does not move further; larger numbers are mm
+UNIT_TOLERANCE = 0.01  # largest difference of a quaternion's length from 1 that rounding explains
 
 
-def read_poses(path: Path, count: int, sources: Sequence[int] | None = None) -> NDArray[np.float64]:
+def read_poses(path: Path, count: int, sources: Sequence[int] | None = None) -> NDArray:
     """(T, 4, 4) poses as the file has them; those of text in mm.
 
     Args:
         path: .npy of (T, 4, 4) or (T, 3, 4), or `poses_bounds.npy` (T, 17), one row per frame, mm; or text with
             `frame x y z qx qy qz qw` in each row, m, as StereoMIS and TUM have it, of the images of a video.
-        count: T.
         sources: position in the video of each frame, from 0; None if the frames are of no video.
-    Raises:
-        InputError: the file is unreadable, has another shape, or holds values that are not rotations.
     """
     if path.suffix.lower() in TEXT_SUFFIXES:
         if sources is None:
             fix = "pass it to `endoprior prepare VIDEO OUT --poses`, which knows their frames and rectifies them."
             raise input_error(path, "poses of these frames, .npy", "poses of the images of a video", fix)
         return _of_images(path, sources)
-    return _of_frames(path, count)
+    stored = read_numpy(path, "camera poses", HINT)
+    shape = "an archive" if isinstance(stored, dict) else stored.shape or "an archive"
+    if isinstance(stored, dict) or shape not in ((count, 4, 4), (count, 3, 4), (count, 17)):
+        raise input_error(path, f"shape ({count}, 4, 4), one pose per frame", str(shape), HINT)
+    if stored.dtype.kind not in "iuf":
+        raise input_error(path, "numbers", str(stored.dtype), HINT)
+    values = stored.astype(np.float64)
+    if shape == (count, 17):
+        values = values[:, :15].reshape(count, 3, 5)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3] = values[:, :3, :4]
+    if not np.isfinite(poses).all():
+        raise input_error(path, "finite numbers", "NaN or infinity", HINT)
+    demand_rotations(path, poses[:, :3, :3], "the upper left 3x3", HINT)
+    return poses
 
 
 def is_model(path: Path) -> bool:
@@ -53,7 +62,7 @@ def is_model(path: Path) -> bool:
 
 def read_model_poses(
     path: Path, sources: Sequence[int], names: Sequence[str] = ()
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], str]:
+) -> tuple[NDArray, NDArray[np.bool_], str]:
     """Poses that a reconstruction program wrote, of the frames that it has a pose for.
 
     Args:
@@ -63,8 +72,6 @@ def read_model_poses(
     Returns:
         (T, 4, 4) camera-to-world in OpenCV axes, in units of the file, with the pose before it where a frame has none;
         (T,) whether a frame has one; and how they were matched.
-    Raises:
-        InputError: no such file, or it cannot be used, or its names do not tell the frames.
     """
     folder = path if path.is_dir() else path.parent
     own = any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
@@ -83,30 +90,12 @@ def read_model_poses(
     places = [matched.files.get(source) for source in sources]
     known = np.array([place is not None for place in places])
     before = np.maximum.accumulate(np.where(known, np.arange(len(places)), np.flatnonzero(known)[0]))
-    poses = np.stack([by_name[files[places[i]]] for i in before])
+    poses = np.array([by_name[files[i]] for i in np.array(places)[before]], np.float64)
     demand_rotations(path, poses[:, :3, :3], "the poses", "Export them again.")
     return poses, known, matched.rule
 
 
-def _of_frames(path: Path, count: int) -> NDArray[np.float64]:
-    stored = read_numpy(path, "camera poses", HINT)
-    shape = getattr(stored, "shape", None)
-    if shape not in ((count, 4, 4), (count, 3, 4), (count, 17)):
-        raise input_error(path, f"shape ({count}, 4, 4), one pose per frame", str(shape or "an archive"), HINT)
-    if stored.dtype.kind not in "iuf":
-        raise input_error(path, "numbers", str(stored.dtype), HINT)
-    values = stored.astype(np.float64)
-    if shape == (count, 17):
-        values = values[:, :15].reshape(count, 3, 5)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3] = values[:, :3, :4]
-    if not np.isfinite(poses).all():
-        raise input_error(path, "finite numbers", "NaN or infinity", HINT)
-    demand_rotations(path, poses[:, :3, :3], "the upper left 3x3", HINT)
-    return poses
-
-
-def _of_images(path: Path, sources: Sequence[int]) -> NDArray[np.float64]:
+def _of_images(path: Path, sources: Sequence[int]) -> NDArray:
     """(T, 4, 4) of the images at these positions of the video."""
     rows = read_table(path, TEXT_HINT)
     if rows.shape[1] != 8:
@@ -127,12 +116,8 @@ def _of_images(path: Path, sources: Sequence[int]) -> NDArray[np.float64]:
     return poses
 
 
-def _rows_of(path: Path, numbers: NDArray[np.float64], sources: Sequence[int]) -> NDArray[np.int_]:
-    """(T,) the row of each image: by its number, from 0 or 1; in order where the first column holds times.
-
-    Raises:
-        InputError: an image has no row.
-    """
+def _rows_of(path: Path, numbers: NDArray, sources: Sequence[int]) -> NDArray[np.int_]:
+    """(T,) the row of each image: by its number, from 0 or 1; in order where the first column holds times."""
     wanted = np.array(sources)
     counted = bool(np.isfinite(numbers).all() and (numbers == np.round(numbers)).all() and (np.diff(numbers) > 0).all())
     by_number = wanted + (0 if numbers[0] == 0 else 1)
@@ -141,7 +126,9 @@ def _rows_of(path: Path, numbers: NDArray[np.float64], sources: Sequence[int]) -
     else:
         rows, missing = wanted, wanted[wanted >= len(numbers)]
     if missing.size:
-        got = f"{len(numbers)} rows, none for image {missing[0]}"
-        fix = "choose other images by --start and --end."
-        raise input_error(path, "a row for each image of the video that is used", got, fix)
+        want, got = (
+            "a row for each image of the video that is used",
+            f"{len(numbers)} rows, none for image {missing[0]}",
+        )
+        raise input_error(path, want, got, "choose other images by --start and --end.")
     return rows

@@ -1,10 +1,14 @@
-"""The camera path of written frames, as `prepare` and `poses` want it: static, estimated, or from a file."""
+"""The camera path of written frames, as `prepare` and `poses` want it: static, estimated, or from a file.
+
+It is estimated by our own tracks, or by COLMAP where that is installed and explains the frames better.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,26 +16,27 @@ from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error, number_ranges
 from ...core.geometry import Convention, length_unit, to_ours
+from ...core.shell import install_command
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import camera_motion
 from ...footage.pose_fit import View, measure_poses
-from .choose import How, find_path
-from .colmap import with_poses
+from .adjust import Observations, adjust, back_projected, residuals
+from .colmap import LONGEST, colmap_path, is_installed, with_poses
 from .follow import follow_camera
+from .own import own_path
 from .pose_file import is_model, read_model_poses, read_poses
-from .tracks import CameraPath, Lens, PoseInput
+from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
 
+USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
 NEGLIGIBLE_DEGREES = 1e-3
-PATH_RECORD = "camera_path.json"
-"""In a sequence folder: how each pose was found, and how sure it is."""
-ASSUMED, CALIBRATED = "assumed field of view", "calibration"
-"""Where the focal length comes from: `sources.lens` of `sequence.json`."""
+PATH_RECORD = "camera_path.json"  # in a sequence folder: how each pose was found, and how sure it is
+ASSUMED, CALIBRATED = "assumed field of view", "calibration"  # origins of the focal length: `sources.lens`
+How = Literal["best", "own", "colmap"]
 METHODS: dict[str, How] = {"auto": "best", "auto-own": "own", "estimate": "best", "own": "own", "colmap": "colmap"}
 """Values of --poses that estimate a path; `still` and files do not."""
-ONLY_IF_MOVING = ("auto", "auto-own")
-"""Those that do so only where the camera moves."""
-WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}
-"""The same by our own tracks alone, which is ten times faster."""
+ONLY_IF_MOVING = ("auto", "auto-own")  # those that do so only where the camera moves
+WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}  # the same, ten times faster
+Frame = Callable[[int], PoseInput]
 
 
 @dataclass(frozen=True)
@@ -39,14 +44,10 @@ class Reading:
     """How the matrices of a file of poses are to be read."""
 
     convention: Convention = "opencv"
-    unit_mm: float = 1.0
-    """mm per unit of the positions."""
-    turn: NDArray[np.float64] | None = None
-    """(3, 3) rotation from the camera that the poses belong to, to that of the frames; None if they are the same."""
-    sources: Sequence[int] | None = None
-    """Position in the video of each frame, from 0, where a file may have a row for each image of a video."""
-    image_names: Sequence[str] = ()
-    """Of all images of the folder that the frames come from, without suffixes, where a file names images."""
+    unit_mm: float = 1.0  # mm per unit of the positions
+    turn: NDArray | None = None  # (3, 3) rotation from the camera of the poses to that of the frames; None: the same
+    sources: Sequence[int] | None = None  # place of each frame in the video, where a file has a row for each image
+    image_names: Sequence[str] = ()  # of all images of the folder of the frames, where a file names images
 
     @property
     def notes(self) -> list[str]:
@@ -57,7 +58,7 @@ class Reading:
         what = "given poses are those of the left camera before rectification"
         return [f"{what}; they are turned as its images are, by {angle:.2f} degrees"]
 
-    def ours(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
+    def ours(self, stored: NDArray) -> NDArray:
         """(T, 4, 4) camera-to-world of the frames, mm, OpenCV axes."""
         poses = to_ours(stored, self.convention, self.unit_mm)
         if self.turn is not None:
@@ -70,7 +71,7 @@ AS_OURS = Reading()
 
 def sequence_path(
     how: str,
-    frame: Callable[[int], PoseInput],
+    frame: Frame,
     views: Callable[[], tuple[Iterable[NDArray[np.uint8]], Iterable[NDArray[np.bool_]]]],
     count: int,
     lens: Lens,
@@ -79,7 +80,7 @@ def sequence_path(
     has_depth: bool,
     refine_focal: bool,
     reading: Reading = AS_OURS,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda _done: None,
 ) -> tuple[CameraPath | None, list[str]]:
     """The path, None for a static camera; and notes for the user.
 
@@ -94,24 +95,7 @@ def sequence_path(
         InputError: the file of poses cannot be used, or COLMAP is asked for and not there.
     """
     if how not in (*METHODS, "still"):
-        known, notes = np.ones(count, bool), list(reading.notes)
-        if is_model(Path(how)):
-            if reading.convention != AS_OURS.convention:
-                want = f"no convention for {how}, whose axes are known"
-                raise input_error("--poses-convention", want, "one", "Remove --poses-convention.")
-            sources = range(count) if reading.sources is None else reading.sources
-            stored, known, rule = read_model_poses(Path(how), sources, reading.image_names)
-            notes.append(f"{how}: poses {rule}; their unit is that of --poses-unit-mm")
-        else:
-            stored = read_poses(Path(how), count, reading.sources)
-        path = CameraPath(reading.ours(stored), known, np.ones(count))
-        if has_depth:
-            notes += _fit_notes(how, stored, frame, lens, reading)
-        if has_depth and lens.depth_is_relative:  # its scale is that at which its points agree with the poses
-            follower = follow_camera(frame, count, lens, progress)
-            world = with_poses(follower, np.linalg.inv(path.camera_to_world), known)
-            path = replace(path, depth_scale=world.scales)
-        return path, notes
+        return _given_path(how, frame, count, lens, has_depth, reading, progress)
     if (reading.convention, reading.unit_mm) != (AS_OURS.convention, AS_OURS.unit_mm):
         got, fix = f"--poses {how}", "Remove --poses-convention and --poses-unit-mm."
         raise input_error("--poses-convention", "a file with --poses", got, fix)
@@ -126,13 +110,116 @@ def sequence_path(
     return path, [*_estimate_notes(motion.reason, path, lens), *path.notes]
 
 
+def _given_path(
+    how: str, frame: Frame, count: int, lens: Lens, has_depth: bool, reading: Reading, progress: Callable[[int], None]
+) -> tuple[CameraPath, list[str]]:
+    known, notes = np.ones(count, bool), list(reading.notes)
+    if is_model(Path(how)):
+        if reading.convention != AS_OURS.convention:
+            want = f"no convention for {how}, whose axes are known"
+            raise input_error("--poses-convention", want, "one", "Remove --poses-convention.")
+        sources = range(count) if reading.sources is None else reading.sources
+        stored, known, rule = read_model_poses(Path(how), sources, reading.image_names)
+        notes.append(f"{how}: poses {rule}; their unit is that of --poses-unit-mm")
+    else:
+        stored = read_poses(Path(how), count, reading.sources)
+    path = CameraPath(reading.ours(stored), known, np.ones(count))
+    if has_depth:
+        notes += _fit_notes(how, stored, frame, lens, reading)
+    if has_depth and lens.depth_is_relative:  # its scale is that at which its points agree with the poses
+        follower = follow_camera(frame, count, lens, progress)
+        world = with_poses(follower, np.linalg.inv(path.camera_to_world), known)
+        path = replace(path, depth_scale=world.scales)
+    return path, notes
+
+
+def find_path(
+    frame: Frame,
+    count: int,
+    lens: Lens,
+    size: tuple[int, int],
+    how: How = "best",
+    *,
+    refine_focal: bool = False,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> CameraPath:
+    """Estimate the camera path.
+
+    Args:
+        frame: reads frame i.
+        size: (width, height), px.
+        how: `best` takes what explains the frames better.
+        refine_focal: the focal length is an assumption.
+        progress: is told the number of frames followed.
+    Raises:
+        InputError: `colmap` without its package, or without a result.
+    """
+    if how == "colmap" and not is_installed():
+        raise input_error("--poses colmap", "the package pycolmap", "none", f"`{install_command('poses')}`.")
+    own, follower = own_path(frame, count, lens, size, refine_focal=refine_focal, progress=progress)
+    if how == "own" or not is_installed():
+        return own
+    if how == "best" and (own.breathes or count > LONGEST):  # COLMAP would give breathing to the camera
+        return own
+    other = colmap_path(frame, count, follower, refine_focal=refine_focal)
+    if other is None:
+        if how == "colmap":
+            raise input_error("--poses colmap", "images that COLMAP can register", "too few", "Use `--poses own`.")
+        return replace(own, notes=[*own.notes, "COLMAP registers too few frames; the path is our own"])
+    other = replace(other, focal_factor=own.focal_factor * other.focal_factor)
+    mine, theirs = (explained_share(follower.tracks, lens, path) for path in (own, other))
+    best = other if how == "colmap" or theirs > mine else own
+    note = f"camera path by {best.method}: COLMAP explains {theirs:.1%} of the held-out tracks, our own path {mine:.1%}"
+    return replace(best, notes=[*own.notes, note, *other.notes] if best is own else [*best.notes, note])
+
+
+def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
+    """Mean over all frames of the mean score of their held-out observations, 0..1: tracks of no estimate.
+
+    Each of these tracks is triangulated from every second of its observations, and compared with the others. A frame
+    without a pose scores 0, so a path gains nothing by dropping hard frames.
+
+    Args:
+        tracks: their points are not used.
+        lens: before any refinement of the focal length.
+    """
+    lens, poses = lens.with_focal(path.focal_factor), np.linalg.inv(path.camera_to_world)
+    frame = np.repeat(np.arange(len(poses)), [len(each) for each in tracks.ids])
+    ids = np.concatenate(tracks.ids)
+    order = np.argsort(ids, kind="stable")  # by track, in time
+    order = order[tracks.held_out(ids[order])]
+    ids, frame = ids[order], frame[order]
+    pixels, depths = np.concatenate(tracks.pixels)[order].astype(np.float64), np.concatenate(tracks.depths)[order]
+    turn = np.arange(len(ids)) - np.searchsorted(ids, ids)
+    fitted = (turn % 2 == 0) & path.explained[frame]
+    inverse = 1 / np.where(depths > 0, depths * path.depth_scale[frame], 1.0)
+    number = np.bincount(ids[fitted], minlength=tracks.count)
+    std = DEPTH_STD[lens.depth_is_relative] * inverse * np.sqrt(np.maximum(number[ids], 1))
+    std = np.where(depths > 0, std, np.inf)
+    sigma = np.stack([np.full(len(ids), USUAL_PX * lens.px), std], 1)
+    points = np.zeros((tracks.count, 3))
+    at = np.flatnonzero(fitted)[::-1]
+    for f in np.unique(frame[at]):
+        here = at[frame[at] == f]
+        points[ids[here]] = back_projected(lens.matrix, poses[f], pixels[here], 1 / inverse[here])
+    seen = Observations(frame[fitted], ids[fitted], pixels[fitted], inverse[fitted], sigma[fitted])
+    done = adjust(lens.matrix, poses, points, seen, np.ones(len(poses), bool), rounds=3, steps=3, widest=8.0)
+    tested = (turn % 2 == 1) & (number[ids] > 0)
+    error = residuals(lens.matrix, poses[frame], done.points[ids], pixels, inverse, sigma)
+    score = np.where(path.explained[frame], 1 / (1 + (error[:, :2] ** 2).sum(1)), 0.0)[tested]
+    total = np.bincount(frame[tested], weights=score, minlength=len(poses))
+    count = np.bincount(frame[tested], minlength=len(poses))
+    rated = (count > 0) | ~path.explained
+    return float((total[rated] / np.maximum(count[rated], 1)).mean()) if rated.any() else 0.0
+
+
 def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
     """Stored depth times a factor; 0, missing, stays, and what is too far for 16 bits becomes it."""
     units = np.round(stored.astype(np.float64) * scale)
     return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
 
-def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], lens: Lens, reading: Reading) -> list[str]:
+def _fit_notes(how: str, stored: NDArray, frame: Frame, lens: Lens, reading: Reading) -> list[str]:
     """A note if the images say that the poses are to be read in another way."""
 
     def view(index: int) -> View:
@@ -141,8 +228,7 @@ def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], len
 
     scaled, turn = stored.copy(), np.eye(3) if reading.turn is None else reading.turn
     scaled[:, :3, 3] *= reading.unit_mm
-    relative = lens.depth_is_relative
-    fit = measure_poses(view, lens.matrix, scaled, reading.convention, turn=turn, relative=relative)
+    fit = measure_poses(view, lens.matrix, scaled, reading.convention, turn=turn, relative=lens.depth_is_relative)
     if fit is not None and fit.another_fits:
         unit = f" --poses-unit-mm {fit.unit * reading.unit_mm:.4g}" if fit.unit * reading.unit_mm != 1 else ""
         words = f"the poses in {how} explain the images better in another way: {fit.reason}"

@@ -11,48 +11,35 @@ from numpy.typing import NDArray
 
 from .adjust import Observations, Resected, refined_pose
 
-REFINED = "refined with the camera path"
-"""Where the focal length may come from: `sources.lens` of `sequence.json`."""
-HELD_OUT = 8
-"""One in this many tracks takes no part in any estimate: it measures how well a path explains the frames."""
-PIXEL_STD = 0.5
-"""Error of a followed corner, px of an image 640 px wide."""
-KEYPOINT_STD = 1.0
-"""Error of a matched keypoint, px of an image 640 px wide."""
-DISPARITY_STD = 0.2
-"""Error of stereo, px."""
-DEPTH_STD = {False: 0.02, True: 0.15}
-"""Error of other depth as a share of it, by whether it is relative."""
+REFINED = "refined with the camera path"  # where the focal length may come from: `sources.lens` of `sequence.json`
+HELD_OUT = 8  # one in this many tracks takes no part in any estimate: it measures how well a path explains the frames
+PIXEL_STD = 0.5  # error of a followed corner, px of an image 640 px wide
+KEYPOINT_STD = 1.0  # error of a matched keypoint, px of an image 640 px wide
+DISPARITY_STD = 0.2  # error of stereo, px
+DEPTH_STD = {False: 0.02, True: 0.15}  # error of other depth as a share of it, by whether it is relative
 
 
 @dataclass(frozen=True)
 class PoseInput:
     """One frame for camera tracking."""
 
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3)."""
-    tissue_mask: NDArray[np.bool_]
-    """(H, W) True outside tools."""
-    depth: NDArray[np.float32]
-    """(H, W) mm, 0 where missing."""
+    rgb_u8: NDArray[np.uint8]  # (H, W, 3)
+    tissue_mask: NDArray[np.bool_]  # (H, W) True outside tools
+    depth: NDArray[np.float32]  # (H, W) mm, 0 where missing
 
 
 @dataclass(frozen=True)
 class Lens:
     """A pinhole camera whose depth was measured; pixel centers are counted from 0, as in OpenCV."""
 
-    matrix: NDArray[np.float64]
-    """(3, 3) K, px."""
-    width: int
-    """Of the image, px."""
-    depth_is_relative: bool
-    """Each frame's depth has a scale of its own."""
-    baseline_mm: float | None = None
-    """Distance between the cameras that measured the depth, mm."""
+    matrix: NDArray  # (3, 3) K, px
+    width: int  # of the image, px
+    depth_is_relative: bool  # each frame's depth has a scale of its own
+    baseline_mm: float | None = None  # distance between the cameras that measured the depth, mm
 
     @classmethod
     def centered_at_half(
-        cls, matrix: NDArray[np.float64], width: int, depth_is_relative: bool, baseline_mm: float | None = None
+        cls, matrix: NDArray, width: int, depth_is_relative: bool, baseline_mm: float | None = None
     ) -> Lens:
         """From K with the left-most pixel centered at 0.5."""
         opencv = np.array(matrix, np.float64)
@@ -75,26 +62,16 @@ class Lens:
 class CameraPath:
     """Poses of all frames."""
 
-    camera_to_world: NDArray[np.float64]
-    """(T, 4, 4), translation in mm; an unexplained frame has the pose of the frame before it."""
-    explained: NDArray[np.bool_]
-    """(T,) whether the pose is linked to those of the other frames."""
-    depth_scale: NDArray[np.float64]
-    """(T,) factor that makes the depth of the frame agree with the path; 1 for depth in mm."""
-    method: str = "file"
-    """Where the poses come from."""
-    focal_factor: float = 1.0
-    """Refined focal length, as a multiple of the given one."""
-    translation_std: NDArray[np.float64] | None = None
-    """(T,) standard deviation of the camera center, mm; NaN where unexplained."""
-    rotation_std: NDArray[np.float64] | None = None
-    """(T,) standard deviation of the rotation, degrees."""
-    still: NDArray[np.bool_] | None = None
-    """(T,) whether the pose is a copy, because the camera rests."""
-    breathes: bool = False
-    """Whether periodic motion of the tissue was told apart from the camera's."""
-    notes: list[str] = field(default_factory=list)
-    """Notes for the user, one line each."""
+    camera_to_world: NDArray  # (T, 4, 4), translation in mm; an unexplained frame has the pose of the frame before it
+    explained: NDArray[np.bool_]  # (T,) whether the pose is linked to those of the other frames
+    depth_scale: NDArray  # (T,) factor that makes the depth of the frame agree with the path; 1 for depth in mm
+    method: str = "file"  # where the poses come from
+    focal_factor: float = 1.0  # refined focal length, as a multiple of the given one
+    translation_std: NDArray | None = None  # (T,) standard deviation of the camera center, mm; NaN where unexplained
+    rotation_std: NDArray | None = None  # (T,) standard deviation of the rotation, degrees
+    still: NDArray[np.bool_] | None = None  # (T,) whether the pose is a copy, because the camera rests
+    breathes: bool = False  # whether periodic motion of the tissue was told apart from the camera's
+    notes: list[str] = field(default_factory=list)  # notes for the user, one line each
 
     @property
     def lost(self) -> list[int]:
@@ -157,19 +134,16 @@ class Tracks:
 
     def see(self, frame: int, ids: NDArray, pixels: NDArray, depths: NDArray) -> None:
         """Add observations to a frame; depth in mm before any scale, 0 where missing."""
-        while len(self.ids) <= frame:
-            self.ids.append(np.zeros(0, np.int32))
-            self.pixels.append(np.zeros((0, 2), np.float32))
-            self.depths.append(np.zeros(0, np.float32))
-        self.ids[frame] = np.concatenate([self.ids[frame], ids.astype(np.int32)])
-        self.pixels[frame] = np.concatenate([self.pixels[frame], pixels.astype(np.float32)])
-        self.depths[frame] = np.concatenate([self.depths[frame], depths.astype(np.float32)])
+        parts = (self.ids, ids, np.int32), (self.pixels, pixels, np.float32), (self.depths, depths, np.float32)
+        for stored, new, kind in parts:
+            stored += [np.zeros((0, *new.shape[1:]), kind)] * (frame + 1 - len(stored))
+            stored[frame] = np.concatenate([stored[frame], new.astype(kind)])
 
     def held_out(self, ids: NDArray) -> NDArray[np.bool_]:
         """(N,) which tracks take no part in estimates."""
         return ids % HELD_OUT == HELD_OUT - 1
 
-    def measured(self, ids: NDArray, depths: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def measured(self, ids: NDArray, depths: NDArray) -> tuple[NDArray, NDArray]:
         """(N,) inverse depth, 1/mm, and (N, 2) standard deviations of pixel and inverse depth."""
         lens, there = self.lens, depths > 0
         inverse = 1 / np.where(there, depths.astype(np.float64), 1.0)
@@ -187,19 +161,14 @@ class Tracks:
             sigma[:, 1] = np.inf
         return refined_pose(self.lens.matrix, start, points, pixels, inverse, sigma, self.weight[ids])
 
-    def of_frames(self, frames: list[int], scales: NDArray, least: int = 2) -> tuple[NDArray[np.int32], Observations]:
-        """Points seen in at least `least` of the frames, and their observations, for an adjustment.
-
-        Args:
-            scales: (T,) factor of the depth of every frame of the clip.
-        """
-        ids = np.concatenate([self.ids[f] for f in frames])
-        camera = np.repeat(np.arange(len(frames)), [len(self.ids[f]) for f in frames])
-        scale = np.repeat(scales[frames], [len(self.ids[f]) for f in frames])
+    def of_frames(self, frames: list[int], scales: NDArray) -> tuple[NDArray[np.int32], Observations]:
+        """Points seen in two frames or more, and their observations. Args: scales: (T,) of the depth of all frames."""
+        ids, numbers = np.concatenate([self.ids[f] for f in frames]), [len(self.ids[f]) for f in frames]
+        camera, scale = np.repeat(np.arange(len(frames)), numbers), np.repeat(scales[frames], numbers)
         pixels = np.concatenate([self.pixels[f] for f in frames]).astype(np.float64)
         depths = np.concatenate([self.depths[f] for f in frames])
         number = np.bincount(ids, minlength=self.count)
-        keep = (number[ids] >= least) & ~self.held_out(ids)
+        keep = (number[ids] >= 2) & ~self.held_out(ids)
         ids, camera, pixels, depths, scale = ids[keep], camera[keep], pixels[keep], depths[keep], scale[keep]
         inverse, sigma = self.measured(ids, depths * scale.astype(np.float32))
         if self.lens.depth_is_relative:

@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """The CPU backend: Numba kernels, float32, forward and hand-written backward, on any number of CPU threads.
 
 Same image and gradients as `reference` up to float32 rounding, and bit-identical for any number of threads.
@@ -15,8 +16,7 @@ from ...core.types import Camera, RenderOutput, Splats
 from ..autograd import Kernels, Tensors, empty, rasterize_with
 from ..projection import check, check_device, jacobian_limits
 from . import tiles
-from .composite_backward import NUM_SUMS, composite_backward, gather
-from .composite_forward import composite_forward
+from .composite import NUM_SUMS, composite_backward, composite_forward, gather
 from .projection import project_backward, project_forward
 
 
@@ -66,11 +66,11 @@ def _composite_forward(
     lists: tiles.Tiles, background: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor, NDArray[np.int64]]:
     shape = size[::-1]
-    images = empty(background, (*shape, 3), shape, shape)
+    color, depth, transmittance = empty(background, (*shape, 3), shape, shape)
     tile_ends = np.empty(len(lists.by_cost), np.int64)
     work = (lists.records, lists.pairs, lists.tile_starts, lists.by_cost, numba.get_num_threads())
-    composite_forward(*work, *_arrays(background, *images), tile_ends)
-    return *images, tile_ends
+    composite_forward(*work, *_arrays(background, color, depth, transmittance), tile_ends)
+    return color, depth, transmittance, tile_ends
 
 
 def _composite_backward(

@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """EWA projection and color of all Gaussians, forward and backward, one Gaussian per iteration.
 
 The PyTorch implementation is `render.projection.project`. Compositing takes the LDL^T factors (a, k, m) of the conic,
@@ -14,27 +15,108 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from .. import sh
 from ..constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
-from .sh import direction_gradient, write_basis
 
 f4 = np.float32
 HALF = f4(0.5)
+C0, C1 = f4(sh.C0), f4(sh.C1)
+C2_XY, C2_ZZ, C2_XX = f4(sh.C2_XY), f4(sh.C2_ZZ), f4(sh.C2_XX)
+C3_CUBE, C3_XYZ, C3_ZZ = f4(sh.C3_CUBE), f4(sh.C3_XYZ), f4(sh.C3_ZZ)
+C3_ZZZ, C3_ZXX = f4(sh.C3_ZZZ), f4(sh.C3_ZXX)
+TWO, THREE, FOUR, SIX, EIGHT = f4(2), f4(3), f4(4), f4(6), f4(8)
 BLOCK = 256
 """Gaussians per task."""
 
 
 @njit(inline="always")
-def _axes(view, quat, scales, axes):
-    # Fills axes (3, 3): columns are the Gaussian's axes in the camera frame, times their standard deviations.
+def _write_basis(x, y, z, num, values):
+    # Fills values[:num] with the harmonics at the unit direction (x, y, z); num is 1, 4, 9 or 16.
+    values[0] = C0
+    if num > 1:
+        values[1], values[2], values[3] = -C1 * y, C1 * z, -C1 * x
+    if num > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        values[4], values[5] = C2_XY * x * y, -C2_XY * y * z
+        values[6] = C2_ZZ * (TWO * zz - xx - yy)
+        values[7], values[8] = -C2_XY * x * z, C2_XX * (xx - yy)
+        if num > 9:
+            values[9] = -C3_CUBE * y * (THREE * xx - yy)
+            values[10] = C3_XYZ * x * y * z
+            values[11] = -C3_ZZ * y * (FOUR * zz - xx - yy)
+            values[12] = C3_ZZZ * z * (TWO * zz - THREE * xx - THREE * yy)
+            values[13] = -C3_ZZ * x * (FOUR * zz - xx - yy)
+            values[14] = C3_ZXX * z * (xx - yy)
+            values[15] = -C3_CUBE * x * (xx - THREE * yy)
+
+
+@njit(inline="always")
+def _direction_gradient(x, y, z, num, v):
+    # dL/d(x, y, z) from v[:num] = dL/d(harmonics), the polynomials taken as they are written above.
+    v_x = v_y = v_z = f4(0)
+    if num > 1:
+        v_x, v_y, v_z = -C1 * v[3], -C1 * v[1], C1 * v[2]
+    if num > 4:
+        v_x += C2_XY * (y * v[4] - z * v[7]) - TWO * C2_ZZ * x * v[6] + TWO * C2_XX * x * v[8]
+        v_y += C2_XY * (x * v[4] - z * v[5]) - TWO * C2_ZZ * y * v[6] - TWO * C2_XX * y * v[8]
+        v_z += -C2_XY * (y * v[5] + x * v[7]) + FOUR * C2_ZZ * z * v[6]
+    if num > 9:
+        xx, yy, zz = x * x, y * y, z * z
+        v_x += -SIX * C3_CUBE * x * y * v[9] + C3_XYZ * y * z * v[10] + TWO * C3_ZZ * x * y * v[11]
+        v_x += -SIX * C3_ZZZ * x * z * v[12] - C3_ZZ * (FOUR * zz - THREE * xx - yy) * v[13]
+        v_x += TWO * C3_ZXX * x * z * v[14] - THREE * C3_CUBE * (xx - yy) * v[15]
+        v_y += -THREE * C3_CUBE * (xx - yy) * v[9] + C3_XYZ * x * z * v[10]
+        v_y += -C3_ZZ * (FOUR * zz - xx - THREE * yy) * v[11] - SIX * C3_ZZZ * y * z * v[12]
+        v_y += TWO * C3_ZZ * x * y * v[13] - TWO * C3_ZXX * y * z * v[14] + SIX * C3_CUBE * x * y * v[15]
+        v_z += C3_XYZ * x * y * v[10] - EIGHT * C3_ZZ * z * (y * v[11] + x * v[13])
+        v_z += C3_ZZZ * (SIX * zz - THREE * xx - THREE * yy) * v[12] + C3_ZXX * (xx - yy) * v[14]
+    return v_x, v_y, v_z
+
+
+@njit(inline="always")
+def _expansion(values, sh, g):
+    # The harmonics `values` times the coefficients of Gaussian g, + 0.5.
+    red = green = blue = HALF
+    for i in range(sh.shape[1]):
+        red += values[i] * sh[g, i, 0]
+        green += values[i] * sh[g, i, 1]
+        blue += values[i] * sh[g, i, 2]
+    return red, green, blue
+
+
+@njit(inline="always")
+def _center(view, mean):
+    # The mean in the world and in the camera.
+    wx, wy, wz = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    x = view[0, 0] * wx + view[0, 1] * wy + view[0, 2] * wz + view[0, 3]
+    y = view[1, 0] * wx + view[1, 1] * wy + view[1, 2] * wz + view[1, 3]
+    z = view[2, 0] * wx + view[2, 1] * wy + view[2, 2] * wz + view[2, 3]
+    return wx, wy, wz, x, y, z
+
+
+@njit(inline="always")
+def _direction(wx, wy, wz, center):
+    # Unit vector from the camera to a point, and 1 / distance.
+    dx, dy, dz = wx - center[0], wy - center[1], wz - center[2]
+    inverse = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    return dx * inverse, dy * inverse, dz * inverse, inverse
+
+
+@njit(inline="always")
+def _axes(view, quat, scales, turn, axes):
+    # Fills turn (3, 3), the rotation, and axes (3, 3): columns are the Gaussian's axes in the camera frame, times their
+    # standard deviations. Returns the quaternion at length 1, and the length it had.
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     length = np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / length, x / length, y / length, z / length
+    turn[0, 0], turn[0, 1], turn[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    turn[1, 0], turn[1, 1], turn[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    turn[2, 0], turn[2, 1], turn[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     for i in range(3):
-        a, b, c = view[i, 0], view[i, 1], view[i, 2]
-        axes[i, 0] = scales[0] * (a * (1 - 2 * (y * y + z * z)) + b * (2 * (x * y + w * z)) + c * (2 * (x * z - w * y)))
-        axes[i, 1] = scales[1] * (a * (2 * (x * y - w * z)) + b * (1 - 2 * (x * x + z * z)) + c * (2 * (y * z + w * x)))
-        axes[i, 2] = scales[2] * (a * (2 * (x * z + w * y)) + b * (2 * (y * z - w * x)) + c * (1 - 2 * (x * x + y * y)))
-    return length
+        for j in range(3):
+            seen = view[i, 0] * turn[0, j] + view[i, 1] * turn[1, j] + view[i, 2] * turn[2, j]
+            axes[i, j] = scales[j] * seen
+    return w, x, y, z, length
 
 
 @njit(inline="always")
@@ -78,31 +160,23 @@ def project_forward(
     # One task per BLOCK Gaussians. Writes one row of each output; culled: all zeros.
     num, num_sh = len(means), sh.shape[1]
     for block in prange((num + BLOCK - 1) // BLOCK):
-        axes, values = np.empty((3, 3)), np.empty(16, f4)
+        axes, turn, values = np.empty((3, 3)), np.empty((3, 3)), np.empty(16, f4)
         for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
             means2d[g] = conic_ldl[g] = colors[g] = f4(0)
             color_slopes2d[g] = f4(0)
             z_out[g] = f4(0)
             radii[g] = 0
-            wx, wy, wz = np.float64(means[g, 0]), np.float64(means[g, 1]), np.float64(means[g, 2])
-            z = view[2, 0] * wx + view[2, 1] * wy + view[2, 2] * wz + view[2, 3]
+            wx, wy, wz, x, y, z = _center(view, means[g])
             if not z > NEAR_Z:  # False for NaN
                 continue
-            x = view[0, 0] * wx + view[0, 1] * wy + view[0, 2] * wz + view[0, 3]
-            y = view[1, 0] * wx + view[1, 1] * wy + view[1, 2] * wz + view[1, 3]
-            length = _axes(view, quats[g], scales[g], axes)
+            _, _, _, _, length = _axes(view, quats[g], scales[g], turn, axes)
             _, _, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
             xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
             px, py = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
 
-            dx, dy, dz = wx - center[0], wy - center[1], wz - center[2]
-            inverse = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-            write_basis(f4(dx * inverse), f4(dy * inverse), f4(dz * inverse), num_sh, values)
-            red = green = blue = HALF
-            for i in range(num_sh):
-                red += values[i] * sh[g, i, 0]
-                green += values[i] * sh[g, i, 1]
-                blue += values[i] * sh[g, i, 2]
+            dx, dy, dz, _ = _direction(wx, wy, wz, center)
+            _write_basis(f4(dx), f4(dy), f4(dz), num_sh, values)
+            red, green, blue = _expansion(values, sh, g)
             # One sum notices every NaN and infinity.
             size = abs(px) + abs(py) + z + xx * yy + abs(red) + abs(green) + abs(blue) + abs(opacities[g])
             for i in range(3):
@@ -128,6 +202,39 @@ def project_forward(
                     radii[g] = np.int32(min(np.ceil(3.0 * np.sqrt(long_axis)), 2.0**30))
 
 
+@njit(inline="always")
+def _pull_color(values, sh, v_colors, g, v_values, v_sh):
+    # Fills dL/d(harmonics) and, for Gaussian g, dL/d(coefficients); nothing passes a channel that is cut off at 0.
+    red, green, blue = _expansion(values, sh, g)
+    v_red = v_colors[g, 0] if red >= f4(0) else f4(0)
+    v_green = v_colors[g, 1] if green >= f4(0) else f4(0)
+    v_blue = v_colors[g, 2] if blue >= f4(0) else f4(0)
+    for i in range(sh.shape[1]):
+        v_values[i] = v_red * sh[g, i, 0] + v_green * sh[g, i, 1] + v_blue * sh[g, i, 2]
+        v_sh[g, i, 0], v_sh[g, i, 1], v_sh[g, i, 2] = values[i] * v_red, values[i] * v_green, values[i] * v_blue
+
+
+@njit(inline="always")
+def _pull_axes(view, v_axes, turn, scales, v_turn, v_scales):
+    # Fills dL/d(rotation) and dL/d(scales).
+    for j in range(3):
+        for i in range(3):
+            v_turn[i, j] = view[0, i] * v_axes[0, j] + view[1, i] * v_axes[1, j] + view[2, i] * v_axes[2, j]
+        v_scales[j] = v_turn[0, j] * turn[0, j] + v_turn[1, j] * turn[1, j] + v_turn[2, j] * turn[2, j]
+        for i in range(3):
+            v_turn[i, j] *= scales[j]
+
+
+@njit(inline="always")
+def _pull_turn(r, w, x, y, z):
+    # dL/d(unit quaternion) from dL/d(rotation) = r.
+    v_w = 2 * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
+    v_x = 2 * (y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0]) + w * (r[2, 1] - r[1, 2]))
+    v_y = 2 * (x * (r[0, 1] + r[1, 0]) + z * (r[1, 2] + r[2, 1]) + w * (r[0, 2] - r[2, 0]))
+    v_z = 2 * (x * (r[0, 2] + r[2, 0]) + y * (r[1, 2] + r[2, 1]) + w * (r[1, 0] - r[0, 1]))
+    return v_w, v_x - 4 * x * (r[1, 1] + r[2, 2]), v_y - 4 * y * (r[0, 0] + r[2, 2]), v_z - 4 * z * (r[0, 0] + r[1, 1])
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_backward(
     means, quats, scales, sh, color_slopes, view, center, lens, radii,
@@ -136,18 +243,15 @@ def project_backward(
     # One task per BLOCK Gaussians. Writes one row of each of the last five; zeros where radii is 0.
     num, num_sh = len(means), sh.shape[1]
     for block in prange((num + BLOCK - 1) // BLOCK):
-        axes, values, v_values = np.empty((3, 3)), np.empty(16, f4), np.empty(16, f4)
-        v_axes, r = np.empty((3, 3)), np.empty((3, 3))
+        axes, turn, v_axes, v_turn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        values, v_values = np.empty(16, f4), np.empty(16, f4)
         for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
             if radii[g] == 0:
                 v_means[g] = v_quats[g] = v_scales[g] = f4(0)
                 v_sh[g] = v_color_slopes[g] = f4(0)
                 continue
-            wx, wy, wz = np.float64(means[g, 0]), np.float64(means[g, 1]), np.float64(means[g, 2])
-            x = view[0, 0] * wx + view[0, 1] * wy + view[0, 2] * wz + view[0, 3]
-            y = view[1, 0] * wx + view[1, 1] * wy + view[1, 2] * wz + view[1, 3]
-            z = view[2, 0] * wx + view[2, 1] * wy + view[2, 2] * wz + view[2, 3]
-            length = _axes(view, quats[g], scales[g], axes)
+            wx, wy, wz, x, y, z = _center(view, means[g])
+            qw, qx, qy, qz, length = _axes(view, quats[g], scales[g], turn, axes)
             slope_x, slope_y, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
             xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
 
@@ -181,9 +285,8 @@ def project_backward(
             gx, gy = lens[0] / z, lens[1] / z
             v_axes[0, 0], v_axes[0, 1], v_axes[0, 2] = gx * vb0, gx * vb1, gx * vb2
             v_axes[1, 0], v_axes[1, 1], v_axes[1, 2] = gy * vc0, gy * vc1, gy * vc2
-            v_axes[2, 0] = -slope_x * v_axes[0, 0] - slope_y * v_axes[1, 0]
-            v_axes[2, 1] = -slope_x * v_axes[0, 1] - slope_y * v_axes[1, 1]
-            v_axes[2, 2] = -slope_x * v_axes[0, 2] - slope_y * v_axes[1, 2]
+            for j in range(3):
+                v_axes[2, j] = -slope_x * v_axes[0, j] - slope_y * v_axes[1, j]
             v_x = v_means2d[g, 0] * gx
             v_y = v_means2d[g, 1] * gy
             v_depth = v_z[g] - (v_x * x + v_y * y) / z
@@ -198,54 +301,18 @@ def project_backward(
                 v_depth -= v_slope * y / (z * z)
 
             # Color -> coefficients and direction of view -> mean.
-            dx, dy, dz = wx - center[0], wy - center[1], wz - center[2]
-            inverse = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
-            write_basis(f4(dx), f4(dy), f4(dz), num_sh, values)
-            red = green = blue = HALF
-            for i in range(num_sh):
-                red += values[i] * sh[g, i, 0]
-                green += values[i] * sh[g, i, 1]
-                blue += values[i] * sh[g, i, 2]
-            v_red = v_colors[g, 0] if red >= f4(0) else f4(0)
-            v_green = v_colors[g, 1] if green >= f4(0) else f4(0)
-            v_blue = v_colors[g, 2] if blue >= f4(0) else f4(0)
-            for i in range(num_sh):
-                v_values[i] = v_red * sh[g, i, 0] + v_green * sh[g, i, 1] + v_blue * sh[g, i, 2]
-                v_sh[g, i, 0], v_sh[g, i, 1], v_sh[g, i, 2] = values[i] * v_red, values[i] * v_green, values[i] * v_blue
-            v_dx, v_dy, v_dz = direction_gradient(f4(dx), f4(dy), f4(dz), num_sh, v_values)
+            dx, dy, dz, inverse = _direction(wx, wy, wz, center)
+            _write_basis(f4(dx), f4(dy), f4(dz), num_sh, values)
+            _pull_color(values, sh, v_colors, g, v_values, v_sh)
+            v_dx, v_dy, v_dz = _direction_gradient(f4(dx), f4(dy), f4(dz), num_sh, v_values)
             along = v_dx * dx + v_dy * dy + v_dz * dz
             v_means[g, 0] = view[0, 0] * v_x + view[1, 0] * v_y + view[2, 0] * v_depth + inverse * (v_dx - along * dx)
             v_means[g, 1] = view[0, 1] * v_x + view[1, 1] * v_y + view[2, 1] * v_depth + inverse * (v_dy - along * dy)
             v_means[g, 2] = view[0, 2] * v_x + view[1, 2] * v_y + view[2, 2] * v_depth + inverse * (v_dz - along * dz)
 
-            # Axes = view R diag(scales) -> scales and R (r holds dL/dR) -> quaternion, through its normalization.
-            w, qx, qy, qz = quats[g, 0] / length, quats[g, 1] / length, quats[g, 2] / length, quats[g, 3] / length
-            for j in range(3):
-                for i in range(3):
-                    r[i, j] = view[0, i] * v_axes[0, j] + view[1, i] * v_axes[1, j] + view[2, i] * v_axes[2, j]
-            v_scales[g, 0] = (
-                r[0, 0] * (1 - 2 * (qy * qy + qz * qz)) + r[1, 0] * 2 * (qx * qy + w * qz)
-                + r[2, 0] * 2 * (qx * qz - w * qy)
-            )  # fmt: skip
-            v_scales[g, 1] = (
-                r[0, 1] * 2 * (qx * qy - w * qz) + r[1, 1] * (1 - 2 * (qx * qx + qz * qz))
-                + r[2, 1] * 2 * (qy * qz + w * qx)
-            )  # fmt: skip
-            v_scales[g, 2] = (
-                r[0, 2] * 2 * (qx * qz + w * qy) + r[1, 2] * 2 * (qy * qz - w * qx)
-                + r[2, 2] * (1 - 2 * (qx * qx + qy * qy))
-            )  # fmt: skip
-            for j in range(3):
-                for i in range(3):
-                    r[i, j] *= scales[g, j]
-            v_w = 2 * (qx * (r[2, 1] - r[1, 2]) + qy * (r[0, 2] - r[2, 0]) + qz * (r[1, 0] - r[0, 1]))
-            v_qx = 2 * (qy * (r[0, 1] + r[1, 0]) + qz * (r[0, 2] + r[2, 0]) + w * (r[2, 1] - r[1, 2]))
-            v_qx -= 4 * qx * (r[1, 1] + r[2, 2])
-            v_qy = 2 * (qx * (r[0, 1] + r[1, 0]) + qz * (r[1, 2] + r[2, 1]) + w * (r[0, 2] - r[2, 0]))
-            v_qy -= 4 * qy * (r[0, 0] + r[2, 2])
-            v_qz = 2 * (qx * (r[0, 2] + r[2, 0]) + qy * (r[1, 2] + r[2, 1]) + w * (r[1, 0] - r[0, 1]))
-            v_qz -= 4 * qz * (r[0, 0] + r[1, 1])
-            along = v_w * w + v_qx * qx + v_qy * qy + v_qz * qz
-            v_quats[g, 0], v_quats[g, 1] = (v_w - along * w) / length, (v_qx - along * qx) / length
+            # Axes = view R diag(scales) -> scales and R -> quaternion, through its normalization.
+            _pull_axes(view, v_axes, turn, scales[g], v_turn, v_scales[g])
+            v_w, v_qx, v_qy, v_qz = _pull_turn(v_turn, qw, qx, qy, qz)
+            along = v_w * qw + v_qx * qx + v_qy * qy + v_qz * qz
+            v_quats[g, 0], v_quats[g, 1] = (v_w - along * qw) / length, (v_qx - along * qx) / length
             v_quats[g, 2], v_quats[g, 3] = (v_qy - along * qy) / length, (v_qz - along * qz) / length

@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """Which Gaussians touch which tile, near to far.
 
 The image is cut into tiles TILE_WIDTH x TILE_HEIGHT. A pair is one Gaussian in one tile, with the rows that its

@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false
 """The GPU backend that needs no CUDA toolkit: kernels written in Triton, float32 on one NVIDIA device.
 
 Same image and gradients as `reference` up to float32 rounding, and bit-identical every time, gradients included: no sum
@@ -94,7 +95,8 @@ def _composite_forward(
     lists: tiles.Tiles, background: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     shape = size[::-1]
-    outputs = (*empty(background, (*shape, 3), shape, shape), torch.empty_like(lists.tile_starts[:-1]))
+    color, depth, transmittance = empty(background, (*shape, 3), shape, shape)
+    outputs = color, depth, transmittance, torch.empty_like(lists.tile_starts[:-1])
     inputs = (lists.records, lists.ranks, lists.tile_starts, background, *size, tiles.columns(size[0]))
     launch(composite_forward, len(outputs[3]), *inputs, *outputs, ROWS=tiles.ROWS_PER_LANE, **WARP)
     return outputs

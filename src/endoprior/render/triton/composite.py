@@ -1,3 +1,4 @@
+# pyright: reportGeneralTypeIssues=false
 """Front-to-back compositing as Triton kernels, forward and backward.
 
 One program of one warp per tile: nothing has to wait for other warps, and checking all pixels takes five shuffles.
@@ -21,6 +22,7 @@ import triton
 import triton.language as tl
 
 from ..constants import ALPHA_MAX, STOP_TRANSMITTANCE
+from .launch import load_three, store_three
 from .tiles import BLUE, HALF_LOG2_E, LOG2_ALPHA_MIN, M_LOG2, RECORD, RED, ROOT, SLOPES, TILE_WIDTH, X
 
 NUM_SUMS = tl.constexpr(16)
@@ -133,9 +135,8 @@ def composite_forward(
         pair = chunk_end
     tl.store(tile_ends + tile, pair)
     t = tl.abs(t)
-    tl.store(color + 3 * place, red + t * tl.load(background), inside)
-    tl.store(color + 3 * place + 1, green + t * tl.load(background + 1), inside)
-    tl.store(color + 3 * place + 2, blue + t * tl.load(background + 2), inside)
+    red, green = red + t * tl.load(background), green + t * tl.load(background + 1)
+    store_three(color + 3 * place, red, green, blue + t * tl.load(background + 2), inside)
     tl.store(depth + place, z, inside)
     tl.store(transmittance + place, t, inside)
 
@@ -175,9 +176,7 @@ def composite_backward(
     """One program per tile. Writes sums (P, NUM_SUMS) by slot; zeros for pairs the forward pass did not need."""
     tile = tl.program_id(0)
     x, y, step, place, inside = _pixels(tile, tiles_x, width, height, ROWS)
-    v_red = tl.load(v_color + 3 * place, inside, 0.0)
-    v_green = tl.load(v_color + 3 * place + 1, inside, 0.0)
-    v_blue = tl.load(v_color + 3 * place + 2, inside, 0.0)
+    v_red, v_green, v_blue = load_three(v_color + 3 * place, inside)
     v_z = tl.load(v_depth + place, inside, 0.0)
     rest = v_red * tl.load(color + 3 * place, inside, 0.0)
     rest += v_green * tl.load(color + 3 * place + 1, inside, 0.0)
@@ -230,8 +229,8 @@ def composite_backward(
 @triton.jit
 def _shift(slopes, red, green, blue, some):
     # Change of the color where the center moves by 1 px, times the cotangents of the color.
-    along = tl.load(slopes, some, 0.0) * red + tl.load(slopes + 1, some, 0.0) * green
-    return along + tl.load(slopes + 2, some, 0.0) * blue
+    along_red, along_green, along_blue = load_three(slopes, some)
+    return along_red * red + along_green * green + along_blue * blue
 
 
 @triton.jit(do_not_specialize=["num"])
@@ -257,22 +256,15 @@ def gather(
         slot = start[:, None] + i + tl.arange(0, SIDE_BY_SIDE)[None, :]
         taken = slot < end[:, None]
         row = sums + slot * NUM_SUMS
-        s_1 += tl.load(row, taken, 0.0)
-        s_x += tl.load(row + 1, taken, 0.0)
-        s_xx += tl.load(row + 2, taken, 0.0)
-        s_u += tl.load(row + 3, taken, 0.0)
-        s_uu += tl.load(row + 4, taken, 0.0)
-        s_ux += tl.load(row + 5, taken, 0.0)
-        s_red += tl.load(row + 6, taken, 0.0)
-        s_green += tl.load(row + 7, taken, 0.0)
-        s_blue += tl.load(row + 8, taken, 0.0)
-        s_z += tl.load(row + 9, taken, 0.0)
-        s_red_x += tl.load(row + 10, taken, 0.0)
-        s_green_x += tl.load(row + 11, taken, 0.0)
-        s_blue_x += tl.load(row + 12, taken, 0.0)
-        s_red_y += tl.load(row + 13, taken, 0.0)
-        s_green_y += tl.load(row + 14, taken, 0.0)
-        s_blue_y += tl.load(row + 15, taken, 0.0)
+        r_1, r_x, r_xx = load_three(row, taken)
+        r_u, r_uu, r_ux = load_three(row + 3, taken)
+        s_1, s_x, s_xx, s_u, s_uu, s_ux = s_1 + r_1, s_x + r_x, s_xx + r_xx, s_u + r_u, s_uu + r_uu, s_ux + r_ux
+        r, g_, b = load_three(row + 6, taken)
+        s_red, s_green, s_blue, s_z = s_red + r, s_green + g_, s_blue + b, s_z + tl.load(row + 9, taken, 0.0)
+        r, g_, b = load_three(row + 10, taken)
+        s_red_x, s_green_x, s_blue_x = s_red_x + r, s_green_x + g_, s_blue_x + b
+        r, g_, b = load_three(row + 13, taken)
+        s_red_y, s_green_y, s_blue_y = s_red_y + r, s_green_y + g_, s_blue_y + b
     some = known & (end > start)
     a, k = tl.load(conic_ldl + 3 * g, some, 1.0), tl.load(conic_ldl + 3 * g + 1, some, 0.0)
     inverse_root = 1.0 / tl.sqrt(a * HALF_LOG2_E)
@@ -283,17 +275,10 @@ def gather(
     slopes, v_slopes = color_slopes2d + 6 * g, v_color_slopes2d + 6 * g
     tl.store(v_means2d + 2 * g, v_x - _shift(slopes, red, green, blue, some), known)
     tl.store(v_means2d + 2 * g + 1, v_y - _shift(slopes + 3, red, green, blue, some), known)
-    tl.store(v_slopes, tl.sum(s_red_x, 1), known)
-    tl.store(v_slopes + 1, tl.sum(s_green_x, 1), known)
-    tl.store(v_slopes + 2, tl.sum(s_blue_x, 1), known)
-    tl.store(v_slopes + 3, tl.sum(s_red_y, 1), known)
-    tl.store(v_slopes + 4, tl.sum(s_green_y, 1), known)
-    tl.store(v_slopes + 5, tl.sum(s_blue_y, 1), known)
-    tl.store(v_conic_ldl + 3 * g, -0.5 * tl.sum(s_uu, 1) * inverse_root * inverse_root, known)
-    tl.store(v_conic_ldl + 3 * g + 1, -a * u_x, known)
-    tl.store(v_conic_ldl + 3 * g + 2, -0.5 * tl.sum(s_xx, 1), known)
+    store_three(v_slopes, tl.sum(s_red_x, 1), tl.sum(s_green_x, 1), tl.sum(s_blue_x, 1), known)
+    store_three(v_slopes + 3, tl.sum(s_red_y, 1), tl.sum(s_green_y, 1), tl.sum(s_blue_y, 1), known)
+    v_a, v_m = -0.5 * tl.sum(s_uu, 1) * inverse_root * inverse_root, -0.5 * tl.sum(s_xx, 1)
+    store_three(v_conic_ldl + 3 * g, v_a, -a * u_x, v_m, known)
     tl.store(v_opacities + g, tl.sum(s_1, 1) / tl.load(opacities + g, some, 1.0), known)
-    tl.store(v_colors + 3 * g, red, known)
-    tl.store(v_colors + 3 * g + 1, green, known)
-    tl.store(v_colors + 3 * g + 2, blue, known)
+    store_three(v_colors + 3 * g, red, green, blue, known)
     tl.store(v_z + g, tl.sum(s_z, 1), known)

@@ -1,3 +1,4 @@
+# pyright: reportGeneralTypeIssues=false
 """EWA projection and color of all Gaussians as Triton kernels, forward and backward, one Gaussian per lane.
 
 The PyTorch implementation is `render.projection.project`. Compositing takes the LDL^T factors (a, k, m) of the conic,
@@ -22,6 +23,7 @@ from torch import Tensor
 from ...core.types import Camera
 from ..constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
 from ..projection import jacobian_limits
+from .launch import load_three, store_three
 from .sh import expand, pull_back
 
 BLOCK = 128
@@ -60,9 +62,8 @@ def _double(value: tl.constexpr):
 @triton.jit
 def _center(row, lens, mask):
     # Means in the world (wx, wy, wz) and in the camera (x, y, z).
-    wx = tl.load(row, mask, 0.0).to(tl.float64)
-    wy = tl.load(row + 1, mask, 0.0).to(tl.float64)
-    wz = tl.load(row + 2, mask, 0.0).to(tl.float64)
+    wx, wy, wz = load_three(row, mask)
+    wx, wy, wz = wx.to(tl.float64), wy.to(tl.float64), wz.to(tl.float64)
     x = tl.load(lens) * wx + tl.load(lens + 1) * wy + tl.load(lens + 2) * wz + tl.load(lens + 3)
     y = tl.load(lens + 4) * wx + tl.load(lens + 5) * wy + tl.load(lens + 6) * wz + tl.load(lens + 7)
     z = tl.load(lens + 8) * wx + tl.load(lens + 9) * wy + tl.load(lens + 10) * wz + tl.load(lens + 11)
@@ -73,9 +74,8 @@ def _center(row, lens, mask):
 def _unit_quat(row, mask):
     # (w, x, y, z) at length 1, and the length it had.
     w = tl.load(row, mask, 1.0).to(tl.float64)
-    x = tl.load(row + 1, mask, 0.0).to(tl.float64)
-    y = tl.load(row + 2, mask, 0.0).to(tl.float64)
-    z = tl.load(row + 3, mask, 0.0).to(tl.float64)
+    x, y, z = load_three(row + 1, mask)
+    x, y, z = x.to(tl.float64), y.to(tl.float64), z.to(tl.float64)
     length = tl.sqrt(w * w + x * x + y * y + z * z)
     return w / length, x / length, y / length, z / length, length
 
@@ -93,12 +93,23 @@ def _to_world(lens, i: tl.constexpr, x, y, z):
 
 
 @triton.jit
-def _spread(lens, j: tl.constexpr, rx, ry, rz, scale, slope_x, slope_y, gx, gy):
-    # Column j of J times the axes, from column j (rx, ry, rz) of the rotation; and that axis' z in the camera frame.
+def _spread(lens, rx, ry, rz, scale, slope_x, slope_y, gx, gy):
+    # One column of J times the axes, from that of the rotation (rx, ry, rz); and that axis' z in the camera frame.
     axis_z = scale * _to_camera(lens, 2, rx, ry, rz)
     b = gx * (scale * _to_camera(lens, 0, rx, ry, rz) - slope_x * axis_z)
     c = gy * (scale * _to_camera(lens, 1, rx, ry, rz) - slope_y * axis_z)
     return b, c, axis_z
+
+
+@triton.jit
+def _kept(value, mask):
+    # In float32; 0 outside the mask.
+    return tl.where(mask, value, 0.0).to(tl.float32)
+
+
+@triton.jit
+def _double_at(place, mask):
+    return tl.load(place, mask, 0.0).to(tl.float64)
 
 
 @triton.jit
@@ -115,11 +126,11 @@ def _project(means, quats, scales, lens, g, mask):
     slope_y = tl.minimum(tl.maximum(y / z, tl.load(lens + LIMITS + 2)), tl.load(lens + LIMITS + 3))
     gx, gy = tl.load(lens + FX) / z, tl.load(lens + FX + 1) / z
     r0, r1, r2 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
-    b0, c0, z0 = _spread(lens, 0, r0, r1, r2, _scale(scales + 3 * g, 0, mask), slope_x, slope_y, gx, gy)
+    b0, c0, z0 = _spread(lens, r0, r1, r2, _scale(scales + 3 * g, 0, mask), slope_x, slope_y, gx, gy)
     r0, r1, r2 = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
-    b1, c1, z1 = _spread(lens, 1, r0, r1, r2, _scale(scales + 3 * g, 1, mask), slope_x, slope_y, gx, gy)
+    b1, c1, z1 = _spread(lens, r0, r1, r2, _scale(scales + 3 * g, 1, mask), slope_x, slope_y, gx, gy)
     r0, r1, r2 = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
-    b2, c2, z2 = _spread(lens, 2, r0, r1, r2, _scale(scales + 3 * g, 2, mask), slope_x, slope_y, gx, gy)
+    b2, c2, z2 = _spread(lens, r0, r1, r2, _scale(scales + 3 * g, 2, mask), slope_x, slope_y, gx, gy)
     bb, bc, cc = b0 * b0 + b1 * b1 + b2 * b2, b0 * c0 + b1 * c1 + b2 * c2, c0 * c0 + c1 * c1 + c2 * c2
     n0, n1, n2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
     blur = _double(_BLUR)
@@ -161,10 +172,8 @@ def project_forward(
     world, center, _, length, _, _, spread, _, cov = _project(means, quats, scales, lens, g, mask)
     x, y, z = center
     xx, xy, yy, det = cov
-    px, py = (
-        tl.load(lens + FX) * x / z + tl.load(lens + FX + 2),
-        tl.load(lens + FX + 1) * y / z + tl.load(lens + FX + 3),
-    )
+    px = tl.load(lens + FX) * x / z + tl.load(lens + FX + 2)
+    py = tl.load(lens + FX + 1) * y / z + tl.load(lens + FX + 3)
     ux, uy, uz, _ = _direction(world, lens)
     num_sh: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
     ahead = mask & (z > _double(_NEAR_Z))  # those behind need no coefficients
@@ -186,22 +195,20 @@ def project_forward(
     long_axis = 0.5 * (xx + yy) + tl.sqrt(half * half + xy * xy)
     radius = tl.where(visible, tl.minimum(tl.ceil(3.0 * tl.sqrt(long_axis)), 1073741824.0), 0.0)
 
-    tl.store(means2d + 2 * g, tl.where(usable, px, 0.0).to(tl.float32), mask)
-    tl.store(means2d + 2 * g + 1, tl.where(usable, py, 0.0).to(tl.float32), mask)
-    tl.store(conic_ldl + 3 * g, tl.where(usable, xx / det, 0.0).to(tl.float32), mask)
-    tl.store(conic_ldl + 3 * g + 1, tl.where(usable, -xy / xx, 0.0).to(tl.float32), mask)
-    tl.store(conic_ldl + 3 * g + 2, tl.where(usable, 1.0 / xx, 0.0).to(tl.float32), mask)
-    tl.store(z_out + g, tl.where(usable, z, 0.0).to(tl.float32), mask)
-    tl.store(colors + 3 * g, tl.where(usable, tl.maximum(red, 0.0), 0.0), mask)
-    tl.store(colors + 3 * g + 1, tl.where(usable, tl.maximum(green, 0.0), 0.0), mask)
-    tl.store(colors + 3 * g + 2, tl.where(usable, tl.maximum(blue, 0.0), 0.0), mask)
+    tl.store(means2d + 2 * g, _kept(px, usable), mask)
+    tl.store(means2d + 2 * g + 1, _kept(py, usable), mask)
+    a, k, m = _kept(xx / det, usable), _kept(-xy / xx, usable), _kept(1.0 / xx, usable)
+    store_three(conic_ldl + 3 * g, a, k, m, mask)
+    tl.store(z_out + g, _kept(z, usable), mask)
+    red, green, blue = tl.maximum(red, 0.0), tl.maximum(green, 0.0), tl.maximum(blue, 0.0)
+    store_three(colors + 3 * g, _kept(red, usable), _kept(green, usable), _kept(blue, usable), mask)
     x0, x1, y0, y1 = _local_per_px(spread, cov)
     for i in tl.static_range(3):
-        first = tl.load(color_slopes + 6 * g + i, mask, 0.0).to(tl.float64)
-        second = tl.load(color_slopes + 6 * g + 3 + i, mask, 0.0).to(tl.float64)
+        first = _double_at(color_slopes + 6 * g + i, mask)
+        second = _double_at(color_slopes + 6 * g + 3 + i, mask)
         row = color_slopes2d + 6 * g + i
-        tl.store(row, tl.where(usable, x0 * first + x1 * second, 0.0).to(tl.float32), mask)
-        tl.store(row + 3, tl.where(usable, y0 * first + y1 * second, 0.0).to(tl.float32), mask)
+        tl.store(row, _kept(x0 * first + x1 * second, usable), mask)
+        tl.store(row + 3, _kept(y0 * first + y1 * second, usable), mask)
     tl.store(radii + g, radius.to(tl.int32), mask)
 
 
@@ -211,7 +218,7 @@ def _store_axis(row, v_row, lens, j: tl.constexpr, r0, r1, r2, vb, vc, vz, gx, g
     v0, v1 = gx * vb, gy * vc
     m0, m1, m2 = _to_world(lens, 0, v0, v1, vz), _to_world(lens, 1, v0, v1, vz), _to_world(lens, 2, v0, v1, vz)
     v_scale = m0 * r0 + m1 * r1 + m2 * r2
-    tl.store(v_row + j, tl.where(mask, v_scale, 0.0).to(tl.float32), written)
+    tl.store(v_row + j, _kept(v_scale, mask), written)
     scale = _scale(row, j, mask)
     return m0 * scale, m1 * scale, m2 * scale
 
@@ -239,14 +246,14 @@ def project_backward(
     x0, x1, y0, y1 = _local_per_px(spread, cov)
     v_x0, v_x1, v_y0, v_y1 = tl.zeros_like(x0), tl.zeros_like(x0), tl.zeros_like(x0), tl.zeros_like(x0)
     for i in tl.static_range(3):
-        along_x = tl.load(v_color_slopes2d + 6 * g + i, mask, 0.0).to(tl.float64)
-        along_y = tl.load(v_color_slopes2d + 6 * g + 3 + i, mask, 0.0).to(tl.float64)
-        first = tl.load(color_slopes + 6 * g + i, mask, 0.0).to(tl.float64)
-        second = tl.load(color_slopes + 6 * g + 3 + i, mask, 0.0).to(tl.float64)
+        along_x = _double_at(v_color_slopes2d + 6 * g + i, mask)
+        along_y = _double_at(v_color_slopes2d + 6 * g + 3 + i, mask)
+        first = _double_at(color_slopes + 6 * g + i, mask)
+        second = _double_at(color_slopes + 6 * g + 3 + i, mask)
         v_x0, v_x1 = v_x0 + along_x * first, v_x1 + along_x * second
         v_y0, v_y1 = v_y0 + along_y * first, v_y1 + along_y * second
-        v_first = tl.where(mask, x0 * along_x + y0 * along_y, 0.0).to(tl.float32)
-        v_second = tl.where(mask, x1 * along_x + y1 * along_y, 0.0).to(tl.float32)
+        v_first = _kept(x0 * along_x + y0 * along_y, mask)
+        v_second = _kept(x1 * along_x + y1 * along_y, mask)
         tl.store(v_color_slopes + 6 * g + i, v_first, written)
         tl.store(v_color_slopes + 6 * g + 3 + i, v_second, written)
     t_b0, t_c0 = (yy * v_x0 - xy * v_y0) / det, (xx * v_y0 - xy * v_x0) / det
@@ -256,9 +263,9 @@ def project_backward(
     v_xy = -t_b0 * y0 - t_b1 * y1 - t_c0 * x0 - t_c1 * x1
 
     # LDL^T factors -> covariance -> rows of J times the axes.
-    v_a = tl.load(v_conic_ldl + 3 * g, mask, 0.0).to(tl.float64)
-    v_k = tl.load(v_conic_ldl + 3 * g + 1, mask, 0.0).to(tl.float64)
-    v_m = tl.load(v_conic_ldl + 3 * g + 2, mask, 0.0).to(tl.float64)
+    v_a = _double_at(v_conic_ldl + 3 * g, mask)
+    v_k = _double_at(v_conic_ldl + 3 * g + 1, mask)
+    v_m = _double_at(v_conic_ldl + 3 * g + 2, mask)
     v_det = -v_a * xx / (det * det)
     v_yy += v_det * xx
     v_xy += -2.0 * v_det * xy - v_k / xx
@@ -268,9 +275,9 @@ def project_backward(
     vb0, vb1, vc0, vc1 = vb0 + t_b0, vb1 + t_b1, vc0 + t_c0, vc1 + t_c1
 
     # Rows of J times the axes, and the center in the image -> center in the camera frame.
-    v_x = tl.load(v_means2d + 2 * g, mask, 0.0).to(tl.float64) * gx
-    v_y = tl.load(v_means2d + 2 * g + 1, mask, 0.0).to(tl.float64) * gy
-    v_depth = tl.load(v_z + g, mask, 0.0).to(tl.float64) - (v_x * x + v_y * y) / z
+    v_x = _double_at(v_means2d + 2 * g, mask) * gx
+    v_y = _double_at(v_means2d + 2 * g + 1, mask) * gy
+    v_depth = _double_at(v_z + g, mask) - (v_x * x + v_y * y) / z
     v_depth -= (vb0 * b0 + vb1 * b1 + vb2 * b2 + vc0 * c0 + vc1 * c1 + vc2 * c2) / z
     inside = (x / z >= tl.load(lens + LIMITS)) & (x / z <= tl.load(lens + LIMITS + 1))
     v_slope = tl.where(inside, -gx * (vb0 * z0 + vb1 * z1 + vb2 * z2), 0.0)
@@ -295,14 +302,9 @@ def project_backward(
     dx, dy, dz = wx.to(tl.float64), wy.to(tl.float64), wz.to(tl.float64)
     along = dx * ux + dy * uy + dz * uz
     dx, dy, dz = inverse * (dx - along * ux), inverse * (dy - along * uy), inverse * (dz - along * uz)
-    dx, dy, dz = (
-        dx + _to_world(lens, 0, v_x, v_y, v_depth),
-        dy + _to_world(lens, 1, v_x, v_y, v_depth),
-        dz + _to_world(lens, 2, v_x, v_y, v_depth),
-    )
-    tl.store(v_means + 3 * g, tl.where(mask, dx, 0.0).to(tl.float32), written)
-    tl.store(v_means + 3 * g + 1, tl.where(mask, dy, 0.0).to(tl.float32), written)
-    tl.store(v_means + 3 * g + 2, tl.where(mask, dz, 0.0).to(tl.float32), written)
+    dx, dy = dx + _to_world(lens, 0, v_x, v_y, v_depth), dy + _to_world(lens, 1, v_x, v_y, v_depth)
+    dz += _to_world(lens, 2, v_x, v_y, v_depth)
+    store_three(v_means + 3 * g, _kept(dx, mask), _kept(dy, mask), _kept(dz, mask), written)
 
     # Axes = view R diag(scales) -> scales and R (m_ij holds dL/dR) -> quaternion, through its normalization.
     v_axis = -slope_x * gx * vb0 - slope_y * gy * vc0
@@ -320,7 +322,7 @@ def project_backward(
     v_j = 2 * (qx * (m01 + m10) + qz * (m12 + m21) + qw * (m02 - m20)) - 4 * qy * (m00 + m22)
     v_k = 2 * (qx * (m02 + m20) + qy * (m12 + m21) + qw * (m10 - m01)) - 4 * qz * (m00 + m11)
     along = v_w * qw + v_i * qx + v_j * qy + v_k * qz
-    tl.store(v_quats + 4 * g, tl.where(mask, (v_w - along * qw) / length, 0.0).to(tl.float32), written)
-    tl.store(v_quats + 4 * g + 1, tl.where(mask, (v_i - along * qx) / length, 0.0).to(tl.float32), written)
-    tl.store(v_quats + 4 * g + 2, tl.where(mask, (v_j - along * qy) / length, 0.0).to(tl.float32), written)
-    tl.store(v_quats + 4 * g + 3, tl.where(mask, (v_k - along * qz) / length, 0.0).to(tl.float32), written)
+    tl.store(v_quats + 4 * g, _kept((v_w - along * qw) / length, mask), written)
+    tl.store(v_quats + 4 * g + 1, _kept((v_i - along * qx) / length, mask), written)
+    tl.store(v_quats + 4 * g + 2, _kept((v_j - along * qy) / length, mask), written)
+    tl.store(v_quats + 4 * g + 3, _kept((v_k - along * qz) / length, mask), written)

@@ -1,3 +1,4 @@
+# pyright: reportGeneralTypeIssues=false
 """The harmonics of `render.sh` and their gradients inside Triton kernels: one Gaussian per lane, float32.
 
 Coefficients are read where they are needed, so that no kernel holds 48 of them at once. The rows of two lanes are far
@@ -11,6 +12,7 @@ import triton
 import triton.language as tl
 
 from .. import sh
+from .launch import load_three, store_three
 
 C0, C1 = tl.constexpr(sh.C0), tl.constexpr(sh.C1)
 C2_XY, C2_ZZ, C2_XX = tl.constexpr(sh.C2_XY), tl.constexpr(sh.C2_ZZ), tl.constexpr(sh.C2_XX)
@@ -37,10 +39,8 @@ def _store_four(place, n0, n1, n2, n3, mask):
 @triton.jit
 def _add(row, i: tl.constexpr, value, red, green, blue, mask):
     # Adds one harmonic times its coefficients.
-    red += value * tl.load(row + 3 * i, mask, 0.0)
-    green += value * tl.load(row + 3 * i + 1, mask, 0.0)
-    blue += value * tl.load(row + 3 * i + 2, mask, 0.0)
-    return red, green, blue
+    r, g, b = load_three(row + 3 * i, mask)
+    return red + value * r, green + value * g, blue + value * b
 
 
 @triton.jit
@@ -95,11 +95,9 @@ def expand(row, x, y, z, mask, DEGREE: tl.constexpr):
 @triton.jit
 def _pull(row, v_row, i: tl.constexpr, value, vr, vg, vb, mask, written):
     # Writes dL/d(coefficients) of one harmonic, and returns dL/d(harmonic).
-    tl.store(v_row + 3 * i, value * vr, written)
-    tl.store(v_row + 3 * i + 1, value * vg, written)
-    tl.store(v_row + 3 * i + 2, value * vb, written)
-    pulled = vr * tl.load(row + 3 * i, mask, 0.0) + vg * tl.load(row + 3 * i + 1, mask, 0.0)
-    return pulled + vb * tl.load(row + 3 * i + 2, mask, 0.0)
+    store_three(v_row + 3 * i, value * vr, value * vg, value * vb, written)
+    r, g, b = load_three(row + 3 * i, mask)
+    return vr * r + vg * g + vb * b
 
 
 @triton.jit

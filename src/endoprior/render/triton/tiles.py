@@ -1,3 +1,4 @@
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false
 """Which Gaussians touch which tile, near to far, on the device.
 
 The image is cut into tiles TILE_WIDTH x TILE_HEIGHT. A pair is one Gaussian in one tile that its footprint (the ellipse
@@ -19,7 +20,7 @@ import triton.language as tl
 from torch import Tensor
 
 from ..constants import ALPHA_MIN
-from .launch import launch
+from .launch import launch, load_three, store_three
 
 TILE_WIDTH, ROWS_PER_LANE = 16, 4
 """px. A tile is the work of one warp: lane 2c + r holds rows r, r + 2, ... of column c."""
@@ -116,20 +117,15 @@ def count_pairs(
     g = tl.load(order + rank, known, 0)
     visible = known & (tl.load(radii + g, known, 0) > 0)
     x, y = tl.load(means2d + 2 * g, visible, 0.0), tl.load(means2d + 2 * g + 1, visible, 0.0)
+    red, green, blue = load_three(colors + 3 * g, visible)
     root = tl.sqrt(tl.load(conic_ldl + 3 * g, visible, 1.0) * HALF_LOG2_E)
     root_k = root * tl.load(conic_ldl + 3 * g + 1, visible, 0.0)
     m = tl.load(conic_ldl + 3 * g + 2, visible, 1.0) * HALF_LOG2_E
     log2_opacity = tl.log2(tl.load(opacities + g, visible, 1.0))
     row = records + rank * RECORD
-    tl.store(row + X, x, visible)
-    tl.store(row + Y, y, visible)
-    tl.store(row + ROOT, root, visible)
-    tl.store(row + ROOT_K, root_k, visible)
-    tl.store(row + M_LOG2, m, visible)
-    tl.store(row + LOG2_OPACITY, log2_opacity, visible)
-    tl.store(row + RED, tl.load(colors + 3 * g, visible, 0.0), visible)
-    tl.store(row + GREEN, tl.load(colors + 3 * g + 1, visible, 0.0), visible)
-    tl.store(row + BLUE, tl.load(colors + 3 * g + 2, visible, 0.0), visible)
+    store_three(row + X, x, y, root, visible)
+    store_three(row + ROOT_K, root_k, m, log2_opacity, visible)
+    store_three(row + RED, red, green, blue, visible)
     tl.store(row + Z, tl.load(z + g, visible, 0.0), visible)
     for i in tl.static_range(6):
         tl.store(row + SLOPES + i, tl.load(color_slopes2d + 6 * g + i, visible, 0.0), visible)

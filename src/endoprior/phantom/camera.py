@@ -1,8 +1,8 @@
-"""Path of a moving endoscope: excursions of about 300 frames that rest, look around and return to the start.
+"""The phantom's cameras, and the path of a moving endoscope.
 
-World axes are those of the left camera of frame 0, mm. An excursion pans along the tissue, turns the view to another
-side, rolls, retreats, approaches and returns; each move is a quintic step up and one down, so that speed and
-acceleration are continuous, and an excursion ends in exactly the pose in which it began.
+A moving endoscope makes excursions of about 300 frames: each pans along the tissue, turns the view to another side,
+rolls, retreats, approaches and returns to exactly the pose in which it began. World axes are those of the left camera
+of frame 0, mm. Each move is a quintic step up and one down: speed and acceleration are continuous.
 """
 
 from __future__ import annotations
@@ -27,7 +27,36 @@ _LOWEST_MM, _HIGHEST_MM = -12.0, 26.0
 """Heights between which the tissue at rest lies."""
 _PAD_MM = 6.0
 """Margin of the material around all that any pose shows."""
-Move = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A camera in outer axes: of the world for the endoscope's left one, for others of the left one in that frame."""
+
+    center: NDArray[np.float64]
+    """(3,) mm."""
+    turn: NDArray[np.float64]
+    """(3, 3) rotation of the camera's axes to the outer ones."""
+
+    @staticmethod
+    def moved(x_mm: float) -> Eye:
+        """A camera moved to the right."""
+        return Eye(np.array([x_mm, 0.0, 0.0]), np.eye(3))
+
+    def sees(self, points: NDArray) -> NDArray[np.float64]:
+        """Points (..., 3) of the outer axes in the axes of this camera, mm."""
+        return (points - self.center) @ self.turn
+
+    @property
+    def world_to_camera(self) -> NDArray[np.float64]:
+        """(4, 4) rigid transform from the outer axes."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.turn.T, -self.turn.T @ self.center
+        return pose
+
+
+STILL = Eye.moved(0.0)
+"""A camera where the outer axes are."""
 
 
 @dataclass(frozen=True)
@@ -37,26 +66,25 @@ class Excursion:
     pan: NDArray[np.float64]
     """(3,) translation along the tissue, mm."""
     pan_turn: NDArray[np.float64]
-    """(2,) rotation vector (about x and y) of the view while it pans, rad."""
     turn: NDArray[np.float64]
-    """(2,) rotation vector of the look to another side, rad."""
+    """(2,) rotation vectors (about x and y) of the view while it pans, and of the look to another side, rad."""
     roll: float
     """Rotation about the optical axis, rad."""
     retreat: float
-    """mm back along the optical axis."""
     approach: float
-    """mm forward along the optical axis."""
+    """mm back and forward along the optical axis."""
 
     def camera_to_world(self, local: float) -> NDArray[np.float64]:
         """(4, 4) pose at time `local` in [0, 1] of the excursion; the identity at both ends."""
-        view = np.zeros(3)
-        view[:2] = _gone(_PAN, local) * self.pan_turn + _gone(_TURN, local) * self.turn
-        angle = _gone(_ROLL, local) * self.roll
+        pan, turned, rolled, back, ahead = (
+            smooth_step(start, done, local) * (1 - smooth_step(returns, ends, local))
+            for start, done, returns, ends in (_PAN, _TURN, _ROLL, _RETREAT, _APPROACH)
+        )
+        angle = rolled * self.roll
         roll = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(view)[0] @ roll
-        forward = _gone(_APPROACH, local) * self.approach - _gone(_RETREAT, local) * self.retreat
-        pose[:3, 3] = _gone(_PAN, local) * self.pan + forward * pose[:3, 2]
+        pose[:3, :3] = cv2.Rodrigues(np.append(pan * self.pan_turn + turned * self.turn, 0.0))[0] @ roll
+        pose[:3, 3] = pan * self.pan + (ahead * self.approach - back * self.retreat) * pose[:3, 2]
         return pose
 
 
@@ -77,11 +105,6 @@ class CameraPath:
     def poses(self, frames: int) -> NDArray[np.float64]:
         """(frames, 4, 4) poses of all frames, mm."""
         return np.stack([self.camera_to_world(index / (frames - 1)) for index in range(frames)])
-
-
-def _gone(move: Move, local: float) -> float:
-    """0..1: how much of a move is done."""
-    return smooth_step(move[0], move[1], local) * (1 - smooth_step(move[2], move[3], local))
 
 
 def build_camera_path(cfg: PhantomConfig, plane: Plane) -> CameraPath:
@@ -127,10 +150,10 @@ def widened(plane: Plane, path: CameraPath, cfg: PhantomConfig) -> Plane:
     (cx, cy), focal = cfg.center, cfg.focal
     corners = np.array([(x, y, focal) for x in (-cx, cfg.width - cx) for y in (-cy, cfg.height - cy)]) / focal
     poses = path.poses(min(cfg.frames, 200 * max(1, len(path.excursions))))
-    rays = corners @ poses[:, :3, :3].transpose(0, 2, 1)
-    eyes = np.array([[0.0, 0, 0], [cfg.baseline_mm, 0, 0]]) @ poses[:, :3, :3].transpose(0, 2, 1)
-    eyes = eyes + poses[:, None, :3, 3]
-    rays, eyes = rays[:, None], eyes[:, :, None] - plane.origin
+    turns = poses[:, :3, :3].transpose(0, 2, 1)
+    rays = (corners @ turns)[:, None]
+    eyes = np.array([[0.0, 0, 0], [cfg.baseline_mm, 0, 0]]) @ turns + poses[:, None, :3, 3]
+    eyes = eyes[:, :, None] - plane.origin
     normal = plane.axes[2]
     found = []
     for height in (_LOWEST_MM - 0.8 * cfg.breathing_mm, _HIGHEST_MM):
