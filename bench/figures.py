@@ -23,10 +23,7 @@ JPEG_QUALITY = 85
 PORT = 8199
 PAGE_SECONDS = 12.0
 """A page drawn without a graphics card takes its time."""
-CLIPS = {
-    "stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97),
-    "mono": ("mono_endo.mp4", None, 169),
-}
+CLIPS = {"stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97), "mono": ("mono_endo.mp4", None, 169)}
 """Video, calibration and the held-out frame that is shown."""
 
 

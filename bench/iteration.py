@@ -37,11 +37,7 @@ NEVER = 1_000_000
 TORCH_MOST = common.Size(20_000, 640, 512)
 """With more Gaussians or pixels, autograd's memory takes torch from seconds to minutes."""
 PARTS = {
-    "deformation": [
-        (motion, "basis_offsets"),
-        (HexPlaneField, "offsets"),
-        (HexPlaneField, "offsets_and_displacement"),
-    ],
+    "deformation": [(motion, "basis_offsets"), (HexPlaneField, "offsets"), (HexPlaneField, "offsets_and_displacement")],
     "projection + SH": [(numba_backend, "project_forward")],
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],

@@ -129,11 +129,7 @@ RUNS = [
     Case("a log broken inside", damaged(RESUME, added(LOG, "{\n{}\n")), ("log.jsonl, line", "'{'"), ("run",)),
     resumed("another config", options="--seed 7", says=("seed",)),
     resumed("other data to resume", without("data/sequence.json"), says=("other data",)),
-    Case(
-        "a camera path that is nowhere",
-        given("render run out --camera-path path.json", needs="run"),
-        ("path.json",),
-    ),
+    Case("a camera path that is nowhere", given("render run out --camera-path path.json", needs="run"), ("path.json",)),
     *(
         Case(f"a camera path {what}", path_of(text), ("path.json",))
         for what, text in {
@@ -211,11 +207,7 @@ SPECS = [
     Case("a spec that extends itself", spec(SOUND + "extends: [spec.yaml]"), ("spec.yaml", "extend itself")),
     Case("a spec that extends a device", spec(SOUND + "extends: [/dev/zero]"), ("/dev/zero",)),
     Case("a field nobody knows", spec(SOUND + "colour: red"), ("spec.yaml", "colour")),
-    Case(
-        "a pipe for a spec",
-        given("bench spec.yaml out", pipe("spec.yaml")),
-        ("spec.yaml", "pipe"),
-    ),
+    Case("a pipe for a spec", given("bench spec.yaml out", pipe("spec.yaml")), ("spec.yaml", "pipe")),
     Case("a variable that is not set", changed("path: data", "path: $NO_SUCH_VARIABLE/data"), leaves=("out",)),
 ]
 CASES = [*RUNS, *SPECS]

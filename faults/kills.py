@@ -1,8 +1,8 @@
 """Signals: a killed training goes on and equals a run that nobody touched; other commands end cleanly.
 
 A third of the kills strike while a checkpoint is being written, a third in the loop, a third anywhere from the first
-moment on: start, loading, first checkpoint, scoring. SIGTERM and SIGHUP, while a command writes, give exit status 130 and
-one line; nothing partial stays.
+moment on: start, loading, first checkpoint, scoring. SIGTERM and SIGHUP, while a command writes, give exit status 130
+and one line; nothing partial stays.
 """
 
 from __future__ import annotations

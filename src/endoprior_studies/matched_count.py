@@ -76,9 +76,7 @@ def next_threshold(search: Search) -> float | None:
 
 
 def search_thresholds(
-    spec: Spec,
-    counts: Callable[[Place], float],
-    train: Callable[[dict[Cell, float]], dict[Cell, Growth | str]],
+    spec: Spec, counts: Callable[[Place], float], train: Callable[[dict[Cell, float]], dict[Cell, Growth | str]]
 ) -> dict[Place, Search]:
     """Search for every method with a `MatchSpec`, in rounds: those of one round train side by side.
 

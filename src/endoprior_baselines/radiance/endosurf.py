@@ -115,10 +115,7 @@ class EndoSurf(RadianceField):
         there = origins + target[:, None] * units
         counted = batch.measured & (there.norm(dim=-1) < 1)
         distance, gradient = self.distance_and_gradient(there, batch.time)
-        terms = {
-            "color": self.color_term(view.color, batch.color),
-            "depth": depth_term(view.depth, target, counted),
-        }
+        terms = {"color": self.color_term(view.color, batch.color), "depth": depth_term(view.depth, target, counted)}
         terms |= surface_terms(distance, (gradient * units).sum(-1), counted)
         assert probed.gradient is not None
         terms["eikonal"] = eikonal_term(probed.gradient, points.norm(dim=-1))
@@ -242,10 +239,7 @@ def surface_terms(distance: Tensor, slope: Tensor, counted: Tensor) -> dict[str,
         distance: (N,) signed distance at the measured points.
         slope: (N,) its change along the ray. The release sums it over all rays; those without depth have no point.
     """
-    return {
-        "surface": SURFACE * _mean(distance.abs(), counted),
-        "angle": ANGLE * _mean(torch.relu(slope), counted),
-    }
+    return {"surface": SURFACE * _mean(distance.abs(), counted), "angle": ANGLE * _mean(torch.relu(slope), counted)}
 
 
 def eikonal_term(gradients: Tensor, radii: Tensor) -> Tensor:
