@@ -30,8 +30,6 @@ AT_A_TIME = 16
 
 @dataclass(frozen=True)
 class Timing:
-    """One timing."""
-
     backend: str
     stage: str
     gaussians: int
@@ -45,7 +43,6 @@ class Timing:
 
 
 def median_ms(step: Callable[[], Any], device: torch.device, repeats: int) -> float:
-    """Median milliseconds of a step, measured on the device where it is a GPU."""
     for _ in range(min(WARM_UP, repeats)):
         step()
     if device.type != "cuda":
@@ -90,7 +87,6 @@ def speed(target: Target, sizes: tuple[common.Size, ...], repeats: int) -> list[
 
 
 def timed(target: Target, stage: str, num: int, step: Callable[[], Any], repeats: int) -> Timing:
-    """One row; an error becomes its note."""
     device = target.device
     on_gpu = device.type == "cuda"
     if on_gpu:
@@ -104,7 +100,6 @@ def timed(target: Target, stage: str, num: int, step: Callable[[], Any], repeats
 
 @torch.no_grad()
 def forward(rasterize: Callable[..., Any], splats: Splats | list[Splats]) -> None:
-    """Forward only."""
     rasterize(splats)
 
 

@@ -30,8 +30,6 @@ SCORES = (
 
 @dataclass(frozen=True)
 class Run:
-    """One training."""
-
     name: str
     frames: int = 0
     start_s: float = 0.0
@@ -49,7 +47,6 @@ class Run:
 
 
 def runs_of(backends: list[render.Backend], folder: Path, iterations: int | None) -> Iterator[Run]:
-    """One training on each backend; a second one with Triton, which promises bit-identical results."""
     for backend in backends:
         yield attempt(backend, folder, backend, iterations)
         if backend == "triton":
@@ -76,7 +73,6 @@ def sequence_at(data: Path | None, frames: int, width: int, height: int) -> Iter
 
 
 def config(backend: render.Backend, iterations: int | None) -> Config:
-    """`default` on a backend, with another number of iterations if one is given."""
     cfg = preset("default")
     cfg = replace(cfg, render=replace(cfg.render, backend=backend))
     if iterations is None:
@@ -113,7 +109,6 @@ def trained(name: str, folder: Path, backend: render.Backend, iterations: int | 
 
 
 def digest(scene: Scene) -> str:
-    """Of all trained numbers of the Gaussians."""
     found = hashlib.sha256()
     for _, value in sorted(scene.gaussians.tensors.items()):
         found.update(value.detach().cpu().contiguous().numpy().tobytes())
@@ -121,13 +116,11 @@ def digest(scene: Scene) -> str:
 
 
 def scores(scene: Scene, sequence: FrameSequence) -> dict[str, float]:
-    """Some scores of the test split, networks left out."""
     found = evaluate(scene, sequence, networks=False).scores
     return {name: found[name] for name in SCORES if name in found}
 
 
 def table(runs: list[Run]) -> list[str]:
-    """Markdown, one row per training."""
     names = [name for name in SCORES if any(name in run.scores for run in runs)]
     facts = ("`default` on", "frames", "start, s", "iterations, s", "iterations/s", "bits")
     lines = header(*facts, *names)
@@ -140,5 +133,4 @@ def table(runs: list[Run]) -> list[str]:
 
 
 def header(*names: str) -> list[str]:
-    """The two first lines of a Markdown table."""
     return [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]

@@ -68,7 +68,6 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
 
 
 def rows(name: str, sequence: FrameSequence, size: common.Size) -> list[common.Row]:
-    """The rows of one preset and size."""
     trainer = started(sequence, config(name, size.num))
     repeated = settle(trainer)
     ours = {"": lambda _: repeat(trainer, repeated)}
@@ -82,7 +81,6 @@ def rows(name: str, sequence: FrameSequence, size: common.Size) -> list[common.R
 
 
 def config(name: str, num: int) -> Config:
-    """The preset with `num` Gaussians, every term active at once, and nothing that changes the number."""
     cfg = preset(name).fitted(68)
     return replace(
         cfg,
@@ -115,6 +113,5 @@ def settle(trainer: GaussianTrainer) -> int:
 
 
 def repeat(trainer: GaussianTrainer, iteration: int) -> StepReport:
-    """Do a fine iteration again: the same frame, the same terms."""
     trainer.state.stage, trainer.state.iteration = Stage.FINE, iteration - 1
     return trainer.step()

@@ -130,7 +130,6 @@ def temporal(num: int, ops: TrainingOps) -> common.Steps:
 
 
 def losses(width: int, height: int, ops: TrainingOps) -> common.Steps:
-    """The supervised losses and their gradient."""
     generator = torch.Generator().manual_seed(0)
     color = torch.rand(height, width, 3, generator=generator, requires_grad=True)
     depth = (torch.rand(height, width, generator=generator) * 60 + 40).requires_grad_()

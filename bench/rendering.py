@@ -53,7 +53,6 @@ def projection(sizes: tuple[common.Size, ...]) -> list[common.Row]:
 
 
 def projected(splats: Splats, camera: Camera) -> tuple[tuple[Tensor, ...], Tensor]:
-    """What the kernels put into the image, opacities last; and the radii."""
     inputs = tuple(getattr(splats, name) for name in INPUTS)
     *found, radii = KERNELS.project_forward(inputs, splats.opacities, camera)
     return (*found, splats.opacities), radii
@@ -146,7 +145,6 @@ def kept_rows(size: common.Size) -> list[common.Row]:
 
 
 def torch_rendering(scene: SingleScene) -> common.Steps:
-    """The same in plain torch."""
     gaussians, field, cfg = scene.gaussians, scene.field, scene.config
 
     @torch.no_grad()

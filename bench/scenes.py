@@ -21,7 +21,6 @@ SIGMA_PX = 2.6
 
 
 def camera(width: int, height: int) -> Camera:
-    """A camera at the origin that looks along z."""
     focal = FOCAL_PER_WIDTH * width
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
@@ -71,7 +70,6 @@ def scene(drawn: Splats, cameras: tuple[Camera, ...], cfg: Config, field: HexPla
 
 
 def sheet(num: int, seed: int = 0) -> Tensor:
-    """(N, 3) points, mm, on a bumpy sheet of 60 x 50 mm, as Gaussians lie on tissue."""
     points = torch.rand(num, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([60.0, 50.0, 0.5])
     points[:, 2] += 60 + 8 * torch.sin(points[:, 0] / 9) * torch.cos(points[:, 1] / 7)
     return points[torch.from_numpy(morton_order(points.numpy()))]

@@ -68,7 +68,6 @@ def measure(trainer: GaussianTrainer) -> dict[int, dict[str, float]]:
 
 
 def main() -> None:
-    """Measure one preset on one sequence."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--preset", default="paper")

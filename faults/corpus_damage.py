@@ -30,22 +30,18 @@ def made(*steps: Step, command: str = CHECK) -> Build:
 
 
 def inside(name: str, step: Step) -> Step:
-    """A step in a folder below."""
     return lambda folder: step(folder / name)
 
 
 def empty_folder(name: str) -> Step:
-    """A new folder."""
     return lambda folder: (folder / name).mkdir()
 
 
 def without(name: str) -> Step:
-    """Removes a file or a folder."""
     return lambda folder: shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
 
 
 def put(name: str, content: bytes | str) -> Step:
-    """Replaces a file by these bytes."""
     data = content.encode() if isinstance(content, str) else content
 
     def damage(data_folder: Path) -> None:
@@ -68,8 +64,6 @@ def everywhere(part: str, pixels: np.ndarray) -> Step:
 
 
 def described(**changes: object) -> Step:
-    """Changes keys of sequence.json, None removes one; NaN is written as such."""
-
     def damage(data: Path) -> None:
         path = data / "sequence.json"
         stored = json.loads(path.read_text(encoding="utf-8")) | changes
@@ -90,17 +84,14 @@ def poses(change: Callable[[np.ndarray], object]) -> Step:
 
 
 def entry(row: int, column: int, value: float) -> Step:
-    """One number of the poses."""
     return poses(lambda p: p.__setitem__((row, column), value))
 
 
 def link(name: str, target: str) -> Step:
-    """A link in place of a file."""
     return lambda data: ((data / name).unlink(missing_ok=True), (data / name).symlink_to(target))
 
 
 def pipe(name: str) -> Step:
-    """A named pipe in place of a file: opening it waits for ever."""
     return lambda data: ((data / name).unlink(missing_ok=True), os.mkfifo(data / name))
 
 
@@ -120,13 +111,10 @@ def instead(name: str) -> Step:
 
 
 def closed(name: str) -> Step:
-    """Takes all rights away."""
     return lambda data: (data / name).chmod(0)
 
 
 def first_frames(count: int) -> Step:
-    """Leaves so many frames."""
-
     def damage(data: Path) -> None:
         for part in ("images", "masks", "depth"):
             for file in sorted((data / part).iterdir())[count:]:
@@ -159,7 +147,6 @@ def sized(width: int, height: int, plain: bool = False) -> Step:
 
 
 def png_chunk(kind: bytes, body: bytes) -> bytes:
-    """One chunk of a PNG file with its checksum."""
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
@@ -177,19 +164,16 @@ def npy(header: str, body: bytes = b"") -> bytes:
 
 
 def whole_npy(array: np.ndarray) -> bytes:
-    """A sound .npy file."""
     written = io.BytesIO()
     np.save(written, array)
     return written.getvalue()
 
 
 def lying_npy(shape: str = "(1000000000, 1000000)", descr: str = "'<f8'") -> bytes:
-    """An .npy file that promises terabytes."""
     return npy(f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}", bytes(64))
 
 
 def npz_bomb(names: tuple[str, ...] = ("a",)) -> bytes:
-    """A small .npz file that unfolds to 2 GB."""
     packed, block = io.BytesIO(), bytes(1 << 20)
     header = lying_npy("(2147483648,)", "'|u1'")[:-64]
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -23,7 +23,6 @@ POSES, FACTS = "poses_bounds.npy", "sequence.json"
 
 
 def stored(name: str, path: str, content: bytes | str, *says: str) -> Case:
-    """A sound sequence with one file of these bytes."""
     return Case(name, damaged(put(path, content)), (path, *says))
 
 

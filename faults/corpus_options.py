@@ -70,12 +70,10 @@ def one_value(command: str, needs: str, option: str, value: str) -> Case:
 
 
 def with_run(name: str, command: str | list[str], *says: str) -> Case:
-    """A command on a sound run."""
     return Case(name, given(command, needs="run"), says)
 
 
 def with_data(name: str, command: str, *says: str) -> Case:
-    """A command on a sound sequence."""
     return Case(name, given(command, needs="sequence"), says)
 
 

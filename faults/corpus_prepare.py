@@ -24,12 +24,10 @@ from corpus_videos import EYES, PLAIN, pictures_folder
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """An encoded picture."""
     return cv2.imencode(".png", pixels)[1].tobytes()
 
 
 def calibrated(name: str, content: bytes | str) -> Build:
-    """A sound video with this calibration."""
     return given(f"prepare clip.mkv out --calibration {name} {PLAIN}", put(name, content), needs="video")
 
 
@@ -39,7 +37,6 @@ def eyes(**changes: object) -> Build:
 
 
 def beside(option: str, name: str, *steps: Step, more: str = "") -> Build:
-    """A sound video of ten pictures with what an option names."""
     words, given_already = PLAIN.split(), (option, *more.split())
     kept = [word for pair in zip(words[::2], words[1::2], strict=True) if pair[0] not in given_already for word in pair]
     return given(["prepare", "clip.mkv", "out", option, name, *more.split(), *kept], *steps, needs="video")
@@ -51,33 +48,27 @@ def ten(folder: str, content: bytes, suffix: str, last: bytes = b"") -> Step:
 
 
 def lens(focal: float) -> list[list[float]]:
-    """A camera matrix with this focal length along x."""
     return [[focal, 0, 1], [0, 90, 1], [0, 0, 1]]
 
 
 def yaml_case(name: str, content: str, *says: str) -> Case:
-    """A calibration of this YAML."""
     return Case(name, calibrated("c.yaml", content), ("c.yaml", *says))
 
 
 def json_case(name: str, content: object, *says: str) -> Case:
-    """A calibration of this JSON."""
     text = content if isinstance(content, str) else json.dumps(content)
     return Case(name, calibrated("c.json", text), ("c.json", *says))
 
 
 def eyes_case(name: str, says: str, **changes: object) -> Case:
-    """A calibration of two eyes with some entries changed."""
     return Case(name, eyes(**changes), ("c.json", says))
 
 
 def ini_case(name: str, content: str) -> Case:
-    """A calibration of this ini file."""
     return Case(name, calibrated("c.ini", content), ("c.ini",))
 
 
 def masks_case(name: str, content: bytes, *says: str, suffix: str = ".png", last: bytes = b"") -> Case:
-    """Ten masks."""
     return Case(name, beside("--masks", "masks", ten("masks", content, suffix, last)), says)
 
 
@@ -87,12 +78,10 @@ def depth_case(name: str, content: bytes, suffix: str, *says: str, leaves: tuple
 
 
 def poses_case(name: str, poses: np.ndarray, *says: str) -> Case:
-    """A sound video with these poses."""
     return Case(name, beside("--poses", "p.npy", lambda f: np.save(f / "p.npy", poses)), ("p.npy", *says))
 
 
 def preparing(out: str, *steps: Step) -> Build:
-    """A sound video, to be written to `out`."""
     return given(["prepare", "clip.mkv", out, *PLAIN.split()], *steps, needs="video")
 
 

@@ -26,7 +26,6 @@ def damaged(command: str, *steps: Step) -> Build:
 
 
 def cut(name: str, by: int) -> Step:
-    """Takes bytes off the end of a file."""
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-by])
 
 
@@ -42,14 +41,12 @@ def flipped(name: str) -> Step:
 
 
 def added(name: str, text: str) -> Step:
-    """Adds text to the end of a file."""
     return lambda folder: (folder / name).write_text(
         (folder / name).read_text(encoding="utf-8") + text, encoding="utf-8"
     )
 
 
 def header(text: bytes | str, length: int | None = None) -> bytes:
-    """A safetensors file that is nothing but a header."""
     encoded = text if isinstance(text, bytes) else text.encode()
     return struct.pack("<Q", len(encoded) if length is None else length) + encoded
 
@@ -60,18 +57,14 @@ def about(text: str) -> bytes:
 
 
 def path_of(text: str) -> Build:
-    """A camera path."""
     return damaged("render run out --camera-path path.json", put("path.json", text))
 
 
 def scene(name: str, *steps: Step, says: tuple[str, ...] = ()) -> Case:
-    """A damaged scene."""
     return Case(name, damaged(RENDER, *steps), (SCENE, *says))
 
 
 def config(name: str, content: bytes | str | Callable[[dict], object], *says: str) -> Case:
-    """A run's config.json of these bytes, or changed."""
-
     def damage(folder: Path) -> None:
         facts = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         content(facts)
@@ -81,7 +74,6 @@ def config(name: str, content: bytes | str | Callable[[dict], object], *says: st
 
 
 def resumed(name: str, *steps: Step, says: tuple[str, ...] = (), options: str = "") -> Case:
-    """A training that cannot be resumed."""
     return Case(name, damaged(f"{RESUME} {options}", *steps), (CHECKPOINT, *says), ("run",))
 
 
@@ -151,12 +143,10 @@ seeds: [0]
 
 
 def spec(text: bytes | str, name: str = "spec.yaml") -> Build:
-    """A spec, reported on only, so that nothing is trained."""
     return given(f"bench {name} out --report-only", put(name, text))
 
 
 def changed(old: str, new: str) -> Build:
-    """A sound spec with one thing changed."""
     assert old in SOUND
     return spec(SOUND.replace(old, new))
 

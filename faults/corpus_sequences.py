@@ -80,13 +80,11 @@ def stereomis(data: Path) -> None:
 
 
 def everywhere_npy(value: float) -> Step:
-    """Depth of one value in all files of a plain folder."""
     content = whole_npy(np.full((40, 48), value, np.float32))
     return lambda data: [put(f"depth/{i}.npy", content)(data) for i in range(3)]
 
 
 def changed(name: str, old: str, new: str) -> Step:
-    """Replaces text in a file."""
     return lambda data: (data / name).write_bytes((data / name).read_bytes().replace(old.encode(), new.encode()))
 
 
@@ -109,7 +107,6 @@ ALPHABETS, NO_TEXT = "dé tà\n☃ 'x'", os.fsdecode(b"\xff\xfe")
 
 
 def moved(name: str) -> Step:
-    """Gives the sequence another name."""
     return lambda folder: (folder / "data").rename(folder / name)
 
 

@@ -12,7 +12,6 @@ MODULES = ("json", "numpy", "dataclasses", "tomllib", "endoprior/__init__")
 
 
 def nothing_ran(folder) -> bool:
-    """Whether no module of the folder was imported."""
     return not (folder / "executed").exists()
 
 

@@ -33,8 +33,6 @@ def video(name: str, content: bytes | str) -> Build:
 
 
 def film(name: str, sizes: list[tuple[int, int]], codec: str = "ffv1", pix_fmt: str = "bgr0") -> Step:
-    """A video of one picture for each (width, height)."""
-
     def encode(folder: Path) -> None:
         with av.open(str(folder / name), "w") as container:
             stream = container.add_stream(codec, rate=25)
@@ -51,7 +49,6 @@ def film(name: str, sizes: list[tuple[int, int]], codec: str = "ffv1", pix_fmt: 
 
 
 def encoded(sizes: list[tuple[int, int]]) -> Build:
-    """A sound video of one picture for each (width, height)."""
     return given(f"prepare clip.mkv out {PLAIN}", film("clip.mkv", sizes))
 
 
@@ -63,7 +60,6 @@ def growing(folder: Path) -> None:
 
 
 def sound_only(folder: Path) -> None:
-    """A film without pictures."""
     with av.open(str(folder / "clip.mp4"), "w") as container:
         stream = container.add_stream("aac", rate=44100)
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 44100), np.float32), format="fltp", layout="mono")
@@ -73,7 +69,6 @@ def sound_only(folder: Path) -> None:
 
 
 def cut_video(suffix: str) -> Build:
-    """A film whose last third is missing."""
     name, codec = f"clip{suffix}", ("ffv1", "bgr0") if suffix == ".mkv" else ("mpeg2video", "yuv420p")
 
     def cut(folder: Path) -> None:
@@ -84,13 +79,11 @@ def cut_video(suffix: str) -> Build:
 
 
 def pictures_folder(*steps: Step, out: str = "out") -> Build:
-    """A folder of pictures in place of a video, damaged."""
     pictures = (picture(f"clip/{i}.png", NOISE) for i in range(3))
     return given(f"prepare clip {out} {PLAIN}", *pictures, *steps)
 
 
 def named(name: str) -> Build:
-    """A sound video of another name."""
     return given(["prepare", name, "out", *PLAIN.split()], lambda f: (f / "clip.mkv").rename(f / name), needs="video")
 
 

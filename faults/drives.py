@@ -41,7 +41,6 @@ class Drive:
 
 
 def failures(work: Path) -> dict[str, list]:
-    """For each command, how often the drive was gone, and how it ended otherwise than it must."""
     from endoprior.cli import main
 
     drive, out, found = Drive(work / "drive"), work / "drive" / "out", {}
@@ -76,7 +75,6 @@ def failures(work: Path) -> dict[str, list]:
 
 
 def main(work: Path) -> list[Row]:
-    """Run that process."""
     data = small_sequence(work / "drive" / "data")
     demand(run(*training(data, work / "drive" / "run", 20)))
     words = [sys.executable, __file__, str(work)]

@@ -64,7 +64,6 @@ def _trained(what: str, iterations: int, data: Path, out: Path, limit_mb: float)
 
 
 def main(work: Path) -> list[Row]:
-    """Run the tests in the folder `work`."""
     source = work / "phantom"
     demand(run("phantom", source, "--frames", 48, "--width", 640, "--height", 512))
     long = long_sequence(source, work / "long", LONG_FRAMES)

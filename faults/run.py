@@ -76,7 +76,6 @@ def table(rows: list[Row], minutes: float) -> str:
 
 
 def main() -> int:
-    """Run the parts and print; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--write", type=Path, help="file whose table is replaced")

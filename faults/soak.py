@@ -18,7 +18,6 @@ GROWTH_MB = 30.0
 
 
 def resident_mb() -> float:
-    """Memory of this process that is in use, MB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
@@ -45,7 +44,6 @@ def train_again_and_again(data: Path, out: Path) -> None:
 
 
 def main(work: Path) -> list[Row]:
-    """Run that process and compare the first with the last."""
     data = work / "data"
     if not data.exists():
         small_sequence(data)
