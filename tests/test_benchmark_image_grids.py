@@ -11,7 +11,7 @@ import torch
 
 from endoprior.core.types import Camera, Frame
 from endoprior.model.scene import Scene
-from endoprior_studies.image_grids import (
+from endoprior_studies.figures import (
     center_density,
     frames_grid,
     instability_map,

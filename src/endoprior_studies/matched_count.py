@@ -87,7 +87,7 @@ def search_thresholds(
         A search per place; those with `value_of` share that of another method.
     """
     found: dict[Place, Search] = {}
-    matches = _matches(spec)
+    matches = matches_of(spec)
     probes = {place: Cell(*place, spec.seeds[0], spec.sequences[place[0]].folds[0]) for place in matches}
     for place, match in matches.items():
         sequence, method, budget = place
@@ -118,31 +118,8 @@ def _next(search: Search) -> float | None:
     return None if search.failure else next_threshold(search)
 
 
-def _matches(spec: Spec) -> dict[Place, MatchSpec]:
+def matches_of(spec: Spec) -> dict[Place, MatchSpec]:
+    """How each threshold is searched."""
     budgets: Sequence[int | None] = spec.budgets or (None,)
     methods = {method: about.match for method, about in spec.methods.items() if about.match}
     return {(s, m, b): match for s in spec.sequences for m, match in methods.items() for b in budgets}
-
-
-def matched_table(spec: Spec, searches: dict[Place, Search]) -> list[str]:
-    """Lines of a Markdown table: what was wanted, and what was found."""
-    titles = ("method", "sequence", "threshold of growth", "Gaussians", "wanted", "trainings")
-    lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
-    matches = _matches(spec)
-    for (sequence, method, budget), search in searches.items():
-        name = spec.label(method) + (f", {budget:,}" if budget else "")
-        value, counted, wanted = _words(matches[sequence, method, budget], search)
-        lines.append(f"| {name} | {sequence} | {value} | {counted} | {wanted} | {len(search.tried)} |")
-    return lines
-
-
-def _words(match: MatchSpec, search: Search) -> tuple[str, str, str]:
-    """The threshold, what it gave and what was wanted, in words."""
-    if search.failure:
-        return f"none: {search.failure}", "-", "-"
-    value = f"{search.best[0]:.3g}"
-    if match.value_of:
-        return value, "-", f"threshold of {match.value_of}"
-    why = f"as {match.count_of}" if match.count_of else f"{match.growth:g} times the start"
-    missed = "" if search.matched else " (not reached)"
-    return value, f"{search.best[1].last:,}{missed}", f"{search.target:,.0f}: {why}"
