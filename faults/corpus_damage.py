@@ -199,6 +199,7 @@ NOISE = np.random.default_rng(0).integers(0, 255, (40, 48, 3), dtype=np.uint8)
 SOUND = cv2.imencode(".png", NOISE)[1].tobytes()
 FLIPPED = SOUND[:300] + bytes([SOUND[300] ^ 255]) + SOUND[301:]
 HALF_JPEG = cv2.imencode(".jpg", NOISE)[1].tobytes()[:600]
+HALF_EXR = b"v/1\x01\x02\0\0\0channels\0"
 NESTED = "[" * 100_000
 IMAGE = "images/000003.png"
 DRAWS = ("check.png",)

@@ -158,10 +158,6 @@ OUTPUTS = [
     with_run("render into no name", ["render", "run", "", "--times", "0"], "empty"),
     with_run("export into nowhere", f"export run {NOWHERE} --format ply", NOWHERE),
     with_run("export over a file", "export run run/config.json --format ply", "run/config.json"),
-    Case(
-        "bench into a file",
-        given("bench spec.yaml out", put("out", "x"), put("spec.yaml", SPEC)),
-        ("OUT out", "a file"),
-    ),
+    Case("bench into a file", given("bench spec.yaml out", put("out", "x"), put("spec.yaml", SPEC)), ("OUT", "a file")),
 ]
 CASES = [*OPTIONS, *OUTPUTS]

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from corpus_case import Build, Case, Step, given
 from corpus_damage import (
+    HALF_EXR,
     NESTED,
     NOISE,
     empty_folder,
@@ -91,6 +92,8 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 )
 TAG = "K_left: !!python/object/apply:os.system ['touch executed']\n"
 ONE_EYE = {"fx": 9, "fy": 9, "cx": 5, "cy": 5}
+WIDE_NPY, METERS = lying_npy("(80, 96000000000)", "'|b1'"), whole_npy(np.full((80, 96), 0.06, np.float32))
+GARBAGE = put("net/config.json", "{"), put("net/model.safetensors", "x")
 TEN_EYES = np.tile(np.eye(4), (10, 1, 1))
 
 CALIBRATIONS = [
@@ -142,24 +145,12 @@ PARTS = [
     masks_case("masks of another size", png(NOISE[..., 0] // 128), "masks/0.png", "96x80", "48x40"),
     masks_case("a mask that is a bomb in the middle", MASK, "masks/9.png", "60000x60000", last=png_bomb()),
     masks_case("masks as pickles", pickled_npy(), "masks/0.npy", "pickle", suffix=".npy"),
-    masks_case(
-        "masks that promise terabytes",
-        lying_npy("(80, 96000000000)", "'|b1'"),
-        "masks/0.npy",
-        "64 bytes",
-        suffix=".npy",
-    ),
+    masks_case("masks that promise terabytes", WIDE_NPY, "masks/0.npy", "64 bytes", suffix=".npy"),
     Case("depth without a unit", beside("--depth", "d", ten("d", DEPTH, ".png")), ("--depth-unit-mm", "none")),
     depth_case("depth of nothing but zeros", png(np.zeros((80, 96), np.uint16)), ".png", leaves=("out",)),
     depth_case("depth that is text", b"hello", ".tiff", "d/0.tiff"),
-    depth_case(
-        "depth in meters called mm",
-        whole_npy(np.full((80, 96), 0.06, np.float32)),
-        ".npy",
-        "--depth-unit-mm",
-        "mm in d",
-    ),
-    depth_case("half an EXR", b"v/1\x01\x02\0\0\0channels\0", ".exr", "d/0.exr"),
+    depth_case("depth in meters called mm", METERS, ".npy", "--depth-unit-mm", "mm in d"),
+    depth_case("half an EXR", HALF_EXR, ".exr", "d/0.exr"),
     Case("no file of poses", beside("--poses", "p.npy"), ("p.npy", "o such file")),
     poses_case("poses of another clip", TEN_EYES[:5], "(10, 4, 4)", "(5, 4, 4)"),
     poses_case("poses that scale", 2 * TEN_EYES, "rotation"),
@@ -167,16 +158,10 @@ PARTS = [
     poses_case("poses in words", np.full((10, 4, 4), "x")),
     Case("poses as a pickle", beside("--poses", "p.npy", put("p.npy", pickled_npy())), ("p.npy", "pickle")),
     Case(
-        "a STIR clip without spots",
-        beside("--stir", "seq", empty_folder("seq"), more="--depth shading"),
-        ("seq", "STIR"),
+        "a STIR clip of no spots", beside("--stir", "seq", empty_folder("seq"), more="--depth shading"), ("seq", "STIR")
     ),
     Case("a network that is nowhere", beside("--depth", "depth-anything:./nowhere"), ("nowhere",)),
-    Case(
-        "a network of garbage",
-        beside("--depth", "depth-anything:net", put("net/config.json", "{"), put("net/model.safetensors", "x")),
-        ("net",),
-    ),
+    Case("a network of garbage", beside("--depth", "depth-anything:net", *GARBAGE), ("net",)),
     Case("the video is the output", preparing("clip.mkv"), ("clip.mkv", "a file")),
     Case("an output that is in use", preparing("out", put("out/x", "x")), ("out", "files in it")),
     Case("an output below a file", preparing("clip.mkv/out"), ("clip.mkv/out", "a path")),

@@ -140,6 +140,8 @@ sequences: {clip: {path: data}}
 methods: {ours: {}}
 seeds: [0]
 """
+CLAIM, TAG = "{score: psnr, method: ours, than: ours, by: .nan}", "!!python/object/apply:os.system ['touch executed']"
+MANY = SOUND.replace("[0]", str(list(range(400)))) + f"budgets: {list(range(1, 301))}"
 
 
 def spec(text: bytes | str, name: str = "spec.yaml") -> Build:
@@ -159,11 +161,7 @@ SPECS = [
     Case("a spec of bytes", spec(bytes(range(256))), ("spec.yaml",)),
     Case("a spec that is a list", spec("[1]"), ("spec.yaml",)),
     Case("a spec whose aliases explode", spec(SOUND + BOMB), ("spec.yaml", "aliases")),
-    Case(
-        "a spec that executes",
-        spec("title: !!python/object/apply:os.system ['touch executed']"),
-        ("spec.yaml", "python/object"),
-    ),
+    Case("a spec that executes", spec(f"title: {TAG}"), ("spec.yaml", "python/object")),
     Case("a spec nested without end", spec(NESTED), ("spec.yaml", "nested")),
     Case("a spec that contains itself", spec("a: &a {b: *a}"), ("spec.yaml", "itself")),
     Case("a TOML spec nested without end", spec("a = " + NESTED, "spec.toml"), ("spec.toml",)),
@@ -175,23 +173,13 @@ SPECS = [
     Case("seeds of NaN", changed("[0]", "[.nan]"), ("spec.yaml", "seeds")),
     Case("seeds below 0", changed("[0]", "[-1]"), ("spec.yaml", "seed")),
     Case("seeds twice", changed("[0]", "[1, 1]"), ("spec.yaml", "seeds")),
-    Case(
-        "more cells than can be run",
-        spec(SOUND.replace("[0]", str(list(range(400)))) + f"budgets: {list(range(1, 301))}"),
-        ("spec.yaml", "120000"),
-    ),
+    Case("more cells than can be run", spec(MANY), ("spec.yaml", "120000")),
     Case("a budget below 0", spec(SOUND + "budgets: [-5]"), ("spec.yaml", "budget")),
-    Case(
-        "a claim by NaN",
-        spec(SOUND + "claims: [{score: psnr, method: ours, than: ours, by: .nan}]"),
-        ("spec.yaml", "by"),
-    ),
+    Case("a claim by NaN", spec(f"{SOUND}claims: [{CLAIM}]"), ("spec.yaml", "by")),
     Case("a setting of NaN", spec(SOUND + "set: {temporal.weight: .nan}"), ("spec.yaml", "weight")),
     Case("a setting that is no field", spec(SOUND + "set: {os.system: 1}"), ("spec.yaml", "os.system")),
     Case(
-        "a phantom beyond all bounds",
-        changed("{path: data}", "{phantom: {frames: 1000000000}}"),
-        ("spec.yaml", "frames"),
+        "a phantom beyond all bounds", changed("path: data", "phantom: {frames: 1000000000}"), ("spec.yaml", "frames")
     ),
     Case("a preset nobody knows", changed("{ours: {}}", "{ours: {preset: finest}}"), ("spec.yaml", "finest")),
     Case("a spec that extends itself", spec(SOUND + "extends: [spec.yaml]"), ("spec.yaml", "extend itself")),
