@@ -7,7 +7,6 @@ degrees of color, with the temporal term, without growth.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import common
@@ -81,14 +80,9 @@ def rows(name: str, sequence: FrameSequence, size: common.Size) -> list[common.R
 
 
 def config(name: str, num: int) -> Config:
-    cfg = preset(name).fitted(68)
-    return replace(
-        cfg,
-        init=replace(cfg.init, budget=num),
-        schedule=replace(cfg.schedule, coarse_iterations=0, half_resolution_iterations=0, sh_every=1),
-        temporal=replace(cfg.temporal, start_iteration=1, min_valid=1),
-        density=replace(cfg.density, start_iteration=NEVER),
-    )
+    changes = {"init.budget": num, "temporal.start_iteration": 1, "temporal.min_valid": 1}
+    changes |= {f"schedule.{stage}_iterations": 0 for stage in ("coarse", "half_resolution")} | {"schedule.sh_every": 1}
+    return preset(name).fitted(68).replace(changes | {"density.start_iteration": NEVER})
 
 
 def started(sequence: FrameSequence, cfg: Config, ops: TrainingOps = NUMBA) -> GaussianTrainer:

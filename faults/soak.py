@@ -26,13 +26,11 @@ def train_again_and_again(data: Path, out: Path) -> None:
     """What the process does."""
     import ctypes
     import gc
-    from dataclasses import replace
 
     import endoprior
 
-    cfg = endoprior.preset("default")
-    schedule = replace(cfg.schedule, coarse_iterations=50, fine_iterations=300)
-    cfg = replace(cfg, schedule=schedule, init=replace(cfg.init, budget=4000))
+    changes = {"schedule.coarse_iterations": 50, "schedule.fine_iterations": 300, "init.budget": 4000}
+    cfg = endoprior.preset("default").replace(changes)
     for i in range(TRAININGS):
         sequence = endoprior.load_sequence(data)
         scene = endoprior.train(sequence, cfg, out=out / str(i))
