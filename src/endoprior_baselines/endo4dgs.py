@@ -143,8 +143,7 @@ def without_scale(depth: Tensor, counted: Tensor) -> Tensor:
 def gradient_correlation(depth: Tensor, target: Tensor, valid: Tensor) -> Tensor:
     """1 - Pearson's correlation of the squared gradients (dx^2 + dy^2) of two depths (H, W), ().
 
-    Args:
-        valid: (H, W) bool; a gradient counts where the pixel, the next one and the one below are valid.
+    A gradient counts where the pixel, the next one and the one below are `valid` (H, W).
     """
     counted = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1]
     if int(counted.sum()) < 2:
@@ -180,11 +179,7 @@ def normal_picture(splats: Splats, draw: Callable[[Splats], RenderOutput]) -> Te
 
 
 def confident_error(value: Tensor, target: Tensor, confidence: Tensor) -> Tensor:
-    """MSE / mean(2 c^2) + mean log c, (); 0 without pixels.
-
-    Args:
-        value, target: (P, C) of the pixels that count. confidence: (P,) c.
-    """
+    """MSE / mean(2 c^2) + mean log c, () of values (P, C) with confidence c (P,); 0 without pixels."""
     if not len(value):
         return value.sum()
     c = confidence.clamp(min=LEAST_CONFIDENCE)

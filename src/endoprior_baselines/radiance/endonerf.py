@@ -84,14 +84,7 @@ class CanonicalNetwork(nn.Module):
         self.color = Linear(WIDTH // 2, 3)
 
     def forward(self, points: Tensor, directions: Tensor) -> Tensor:
-        """Color in (0, 1), then density before its ReLU.
-
-        Args:
-            points: (P, 3) at time 0.
-            directions: (P, 3) unit directions of the rays.
-        Returns:
-            (P, 4).
-        """
+        """(P, 4) color in (0, 1), then density before its ReLU, at points (P, 3) seen along unit directions (P, 3)."""
         features = self.trunk(encoded(points, POSITION), self.feature, self.density)
         seen = torch.cat([features[:, :WIDTH], encoded(directions, DIRECTION)], -1)
         layers = [(layer.weight, layer.bias) for layer in (self.view, self.color)]
@@ -165,10 +158,8 @@ class EndoNeRF(RadianceField):
     def view(self, rays: Rays, time: float, first: Tensor, rng: np.random.Generator | None) -> Composited:
         """Rays with samples at u = `first` (N, S) and more where those are dense; depth in units of u.
 
-        Every sample goes through the networks once; the release evaluates the first ones again among all.
-
-        Args:
-            rng: chooses places and adds noise to density; None does neither.
+        Every sample goes through the networks once; the release evaluates the first ones again among all. `rng` chooses
+        places and adds noise to density; None does neither.
         """
         values = self._values(rays, time, first)
         with torch.no_grad():
@@ -211,12 +202,9 @@ def expected(view: Composited) -> Tensor:
 
 
 def loss_terms(view: Composited, color: Tensor, depth: Tensor, measured: Tensor) -> dict[str, Tensor]:
-    """Weighted terms, () each.
+    """Weighted terms of color (N, 3), and of depth (N,) in the unit of the view's where it is measured.
 
     Without a depth, the release compares with 0, which its depth maps hold there; here such rays have color only.
-
-    Args:
-        color: (N, 3). depth: (N,) in the unit of the view's depth. measured: (N,) where it counts.
     """
     apart = huber_loss(expected(view), depth, delta=HUBER_DELTA, reduction="none")
     share = torch.where(measured, apart, torch.zeros_like(apart)).sum() / measured.sum().clamp(min=1)

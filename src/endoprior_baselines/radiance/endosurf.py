@@ -146,8 +146,7 @@ class EndoSurf(RadianceField):
     ) -> tuple[Composited, Probed, Tensor]:
         """What rays show, depth as s; the networks at the samples, and where those are (P, 3).
 
-        Args:
-            shift: (N, 1) in [-0.5, 0.5), how far all samples of a ray are moved, in steps; None: not at all.
+        `shift` (N, 1) in [-0.5, 0.5) moves all samples of a ray, in steps.
         """
         step = 2 / self.cfg.even_samples
         with torch.no_grad():
@@ -233,21 +232,15 @@ def depth_term(depth: Tensor, target: Tensor, counted: Tensor) -> Tensor:
 
 
 def surface_terms(distance: Tensor, slope: Tensor, counted: Tensor) -> dict[str, Tensor]:
-    """At the measured surface the distance is 0, and it falls along the ray.
+    """At the measured points the signed distance (N,) is 0, and its change `slope` (N,) along the ray is below 0.
 
-    Args:
-        distance: (N,) signed distance at the measured points.
-        slope: (N,) its change along the ray. The release sums it over all rays; those without depth have no point.
+    The release sums the latter over all rays; those without depth have no point.
     """
     return {"surface": SURFACE * _mean(distance.abs(), counted), "angle": ANGLE * _mean(torch.relu(slope), counted)}
 
 
 def eikonal_term(gradients: Tensor, radii: Tensor) -> Tensor:
-    """A distance changes by 1 per unit: mean of (|gradient| - 1)^2 over samples near the scene.
-
-    Args:
-        gradients: (P, 3). radii: (P,) distances of the samples from the center.
-    """
+    """A distance changes by 1 per unit: mean of (|gradient| - 1)^2 over samples (P, 3) at small radii (P,)."""
     return EIKONAL * _mean((gradients.norm(dim=-1) - 1).square(), radii < EIKONAL_WITHIN)
 
 
@@ -266,12 +259,9 @@ def _mean(values: Tensor, counted: Tensor) -> Tensor:
 
 @torch.no_grad()
 def first_crossing(distance: Callable[[Tensor], Tensor], origins: Tensor, units: Tensor) -> Tensor:
-    """Points at which rays enter the surface, by even steps within the unit sphere and then the secant method.
+    """(K, 3) points at which K of N rays enter the surface: even steps within the unit sphere, then the secant method.
 
-    Args:
-        distance: (P, 3) to (P,). origins, units: (N, 3) of the rays.
-    Returns:
-        (K, 3) points of the K <= N rays that do.
+    `distance` gives (P,) of (P, 3).
     """
     s = even(*sphere_ends(origins, units), STEPS)
     points = origins[:, None] + s[..., None] * units[:, None]

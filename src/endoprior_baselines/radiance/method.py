@@ -33,7 +33,6 @@ class RadianceMethod(Method):
     only: Mapping[str, Any] = {"data.eyes": "left", "init.motion": "rest"}
 
     def __init__(self, kind: type[RadianceField], config: Callable[[], Config]) -> None:
-        """Args: kind: of the field. config: what its preset starts from."""
         self.kind, self._config = kind, config
 
     def config(self) -> Config:

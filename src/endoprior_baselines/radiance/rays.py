@@ -57,11 +57,7 @@ class Rays:
 
 
 def rays_of(camera: Camera, pixels: NDArray[np.integer], device: torch.device | str = "cpu") -> Rays:
-    """The rays through the centers of some pixels.
-
-    Args:
-        pixels: (N,) row * width + column; the center of pixel (0, 0) is at (0.5, 0.5).
-    """
+    """The rays through the centers of `pixels` (N,), row * width + column; that of (0, 0) is at (0.5, 0.5)."""
     rows, columns = np.divmod(np.asarray(pixels), camera.width)
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     directions = np.stack([x, y, np.ones_like(x)], -1) @ camera.world_to_camera[:3, :3]
@@ -97,7 +93,6 @@ class RayFrames:
     """The training frames of a sequence by position, 0 to len - 1."""
 
     def __init__(self, sequence: FrameSequence, *, only_measured: bool) -> None:
-        """Args: only_measured: draw pixels with a depth only."""
         self.sequence, self.only_measured = sequence, only_measured
         self.indices = sequence.indices("train")
 
@@ -152,11 +147,7 @@ class RayFrames:
         return np.where(measured(frame), frame.depth, np.float32(0))
 
     def depth_percentiles(self, low: float, high: float, *, missing: bool) -> tuple[float, float]:
-        """Percentiles of the depths of all training frames, mm; 0 without any depth.
-
-        Args:
-            missing: a missing depth counts as 0; else it does not count.
-        """
+        """Percentiles of the depths of all training frames, mm; 0 without any. `missing` depth counts as 0, or not."""
         every = max(1, len(self) * self.camera.width * self.camera.height // MOST_DEPTHS)
         depths = np.concatenate([self.depth(k).ravel()[::every] for k in range(len(self))])
         depths = depths if missing else depths[depths > 0]

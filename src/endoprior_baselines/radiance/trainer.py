@@ -92,13 +92,7 @@ class RadianceTrainer(Trainer):
     state: RadianceState
 
     def __init__(self, sequence: FrameSequence, cfg: Config, kind: type[RadianceField]) -> None:
-        """Prepare; nothing is computed yet.
-
-        Args:
-            kind: the field to train.
-        Raises:
-            InputError: the cameras cannot be used, or the backend has no device here.
-        """
+        """Prepare to train a `kind` of field; InputError if cameras cannot be used, or the backend has no device."""
         self.sequence, self.cfg, self.kind = sequence, cfg.fitted(len(sequence)), kind
         self.radiance = radiance_of(self.cfg)
         self.device = device_for(cfg.render.backend)
@@ -220,11 +214,7 @@ def due(iteration: int, every: int) -> bool:
 
 
 def refined(measured: Tensor, rendered: Tensor, tissue: Tensor) -> Tensor:
-    """(H, W) depth, mm, in which the worst tenth of all pixels has the rendered depth.
-
-    Args:
-        measured: (H, W) mm, 0 where missing. rendered: (H, W) mm. tissue: (H, W) bool; other pixels count as right.
-    """
+    """(H, W) depth, mm, in which the worst tenth of all pixels has the rendered depth; what is no tissue is right."""
     error = torch.where(tissue, (rendered - measured).square(), torch.zeros_like(measured))
     limit = error.flatten().kthvalue(max(1, round((1 - OUTLIERS) * error.numel()))).values
     return torch.where(error > limit, rendered, measured)
