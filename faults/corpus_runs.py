@@ -106,7 +106,7 @@ RUNS = [
     config("a config with an impossible path", lambda c: c["data"].update(path="\0" + "x" * 5000), "xxx"),
     Case("a pipe for a config", damaged(EVAL, pipe(CONFIG)), ("config.json",)),
     Case("other data", given(f"{EVAL} --data other", put("other/images/a.png", "x"), needs="run"), ("other",)),
-    resumed("nothing to resume", without(CHECKPOINT), without(CONFIG)),
+    Case("nothing to resume", damaged(RESUME, without(CHECKPOINT), without(CONFIG)), (CONFIG, "a run"), ("run",)),
     resumed("a checkpoint cut short", cut(CHECKPOINT, 100)),
     resumed("a checkpoint with one bit flipped", flipped(CHECKPOINT), says=("the bits that were written",)),
     resumed("a checkpoint of noise", put(CHECKPOINT, BYTES * 20)),

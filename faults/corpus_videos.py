@@ -10,9 +10,8 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
-from corpus_bombs import mov_bomb
 from corpus_case import Build, Case, Step, given
-from corpus_damage import NOISE, SOUND, empty_folder, link, picture, pipe, png_bomb, put
+from corpus_damage import NOISE, SOUND, empty_folder, link, mov_bomb, picture, pipe, png_bomb, put
 
 PLAIN = "--border keep --masks none --depth none --poses still"
 """Options that leave the video alone."""

@@ -19,7 +19,6 @@ import drives
 import kills
 import limits
 import shortage
-import soak
 from corpus import CASES
 from harness import ENVIRONMENT, Row
 
@@ -59,8 +58,8 @@ PARTS: dict[str, Callable[[Path], list[Row]]] = {
     "memory": shortage.memory,
     "inputs": inputs,
     "properties": properties,
-    "soak": soak.main,
-    "limits": limits.main,
+    "soak": limits.soak,
+    "limits": limits.limits,
 }
 
 
