@@ -191,10 +191,10 @@ def test_learning_rates_a_million_times_too_high_end_in_words(tiny_sequence, tmp
 def test_a_run_that_lost_every_gaussian_can_be_read_again(tiny_sequence, tmp_path):
     cfg = tiny_config("basis", coarse=0)
     cfg = replace(cfg, density=replace(cfg.density, prune_opacity=1.0, start_iteration=0, every=5))
-    with pytest.raises(Diverged, match=r"after iteration 5 .*faded"):
+    with pytest.raises(Diverged, match=r"after iteration 5 .*removed"):
         train(load_sequence(tiny_sequence), cfg, tmp_path / "run")
     steps = []
-    with pytest.raises(Diverged, match=r"after iteration 10 .*faded"):
+    with pytest.raises(Diverged, match=r"after iteration 10 .*removed"):
         train(load_sequence(tiny_sequence), cfg, tmp_path / "run", resume=True, on_step=lambda r, _: steps.append(r))
     assert [report.iteration for report in steps] == [6, 7, 8, 9]
 

@@ -106,7 +106,7 @@ class Endo4DGS(GaussianMethod):
         mask, color = frame.tissue_mask[..., None], out.color * frame.tissue_mask[..., None]
         known, valid = frame.depth, frame.measured & (out.depth > 0)
         depth, target = without_scale(out.depth, valid), without_scale(known, valid)
-        facing = (normal_picture(drawn.splats, drawn.draw) * normals_of_depth(known)).sum(-1)
+        facing = (normal_picture(drawn.splats, drawn.render) * normals_of_depth(known)).sum(-1)
         trust = out.alpha[frame.tissue_mask]
         picture = confident_error(out.color[frame.tissue_mask], frame.rgb[frame.tissue_mask], trust)
         surface = confident_error(depth[valid][:, None], target[valid][:, None], out.alpha[valid])

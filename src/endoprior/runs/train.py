@@ -179,8 +179,8 @@ class TrainingRun:
         restored = self.resume and checkpoint.is_file()  # not if it was stopped before its first checkpoint
         if restored:
             load_checkpoint(trainer, checkpoint, fingerprint)
-        resume = self.resume and not restored
-        record_run(out, trainer.sequence, trainer.cfg, fingerprint, resume=resume, **self.facts)
+        compare_with_record = self.resume and not restored  # the checkpoint has been compared
+        record_run(out, trainer.sequence, trainer.cfg, fingerprint, resume=compare_with_record, **self.facts)
         if not restored:
             trainer.start()
         cut_log(out / LOG, trainer.state.stage, trainer.state.iteration)

@@ -1,4 +1,5 @@
-"""One training iteration: batch, deform, render, loss, backward, check, update, density (`TrainingStep.__call__`)."""
+"""One training iteration: batch, deform, render, loss, backward, check, observe, update, density
+(`TrainingStep.__call__`)."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ class Before(NamedTuple):
     """The training frame just before, with which the temporal term compares."""
 
     frame: TrainingFrame
-    tissue_now: Tensor  # (H, W) bool: the tissue mask of the rendered frame, missed tools included
+    tissue_mask_now: Tensor  # (H, W) bool of the rendered frame: True at a tool that the masks miss, too
     means: Tensor | None  # (N, 3) centers at the frame before, mm, where they are known already
 
 
@@ -57,7 +58,7 @@ class Drawn:
     offsets: Offsets | None  # what moved them; None in the coarse stage
     splats: Splats  # the Gaussians as they were rendered
     out: RenderOutput
-    draw: Callable[[Splats], RenderOutput]  # renders other Gaussians from the same camera
+    render: Callable[[Splats], RenderOutput]  # other Gaussians from the same camera
     context: Any  # what the method's `context` made of all training frames
     before: Before | None = None  # the frame before, where the temporal term takes part
     is_right: bool = False  # of the right eye: only its image and depth are compared
@@ -104,7 +105,8 @@ class TrainingStep:
 
         drawn = self.draw(state, rng)
         terms, color_error = self.loss(state, drawn)
-        sum(terms.values(), torch.zeros(())).backward()
+        loss = sum(terms.values(), torch.zeros(()))
+        loss.backward()
         unusable, empty_error = state.optimizer.count_unusable(), method.empty_error(drawn.frame.brightness)
         wait = densify or reset or last
         try:
@@ -130,43 +132,65 @@ class TrainingStep:
         return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, missed)
 
     def draw(self, state: GaussiansState, rng: np.random.Generator) -> Drawn:
-        """Batch, deform, render; nothing is changed. `rng` belongs to the iteration."""
+        """Batch, deform, render; nothing is changed.
+
+        Args:
+            rng: that of the iteration, from which the splits of density control are drawn later.
+        """
         cfg, iteration, fine = self.cfg, state.iteration + 1, state.stage is Stage.FINE
         position = self.method.position(cfg.seed, state.stage, iteration, len(self.frames), rng)
         is_right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
         half = fine and iteration <= cfg.schedule.half_resolution_iterations
-        frame = counted = self.frames.frame(position, half=half, right=is_right)
-        previous = None
+        frame = self.frames.frame(position, half=half, right=is_right)
+        frame_before = None
         if fine and not is_right and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
-            previous = self.frames.before(position)
+            frame_before = self.frames.before(position)
 
         gaussians, model_ops, offsets, means_before = state.gaussians, self.ops.model, None, None
-        if fine and previous and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
+        if fine and frame_before and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
+            # Both times at once: the planes are read once for what they share.
             means = gaussians["means"]
-            offsets, moved = state.field.offsets_and_displacement(means, frame.time, previous.time, model_ops)
-            means_before = means + moved
+            offsets, displacement = state.field.offsets_and_displacement(
+                means, frame.time, frame_before.time, model_ops
+            )
+            means_before = means + displacement
         elif fine:
             offsets = self.motion.offsets(gaussians, state.field, frame.time, cfg, model_ops)
         splats = gaussians.splats(offsets, sh_degree(cfg, state.stage, iteration))
 
-        depth_grad = cfg.render.depth_grad_to_means
-        draw = partial(self.rasterize, camera=frame.camera, background=self.background, depth_grad_to_means=depth_grad)
-        out = draw(splats)
-        out.means2d.retain_grad()
-        left_out = None
+        render = partial(
+            self.rasterize,
+            camera=frame.camera,
+            background=self.background,
+            depth_grad_to_means=cfg.render.depth_grad_to_means,
+        )
+        out = render(splats)
+        out.means2d.retain_grad()  # density control grows where this gradient is large
+        compared, left_out = frame, None
         if self.doubt and fine and not is_right and iteration > START * stage_length(cfg, Stage.FINE):
-            counted = self.doubt.counted(frame, out.color)
-            left_out = self.doubt.share(frame, counted)
-        before = previous and Before(previous, frame.tissue_mask, means_before)
-        moved_by = (gaussians, state.field, offsets, splats)
+            compared = self.doubt.counted(frame, out.color)
+            left_out = self.doubt.share(frame, compared)
         return Drawn(
-            state.stage, iteration, position, counted, *moved_by, out, draw, self.context, before, is_right, left_out
+            stage=state.stage,
+            iteration=iteration,
+            position=position,
+            frame=compared,
+            gaussians=gaussians,
+            field=state.field,
+            offsets=offsets,
+            splats=splats,
+            out=out,
+            render=render,
+            context=self.context,
+            before=Before(frame_before, frame.tissue_mask, means_before) if frame_before else None,
+            is_right=is_right,
+            left_out=left_out,
         )
 
     def loss(self, state: GaussiansState, drawn: Drawn) -> tuple[dict[str, Tensor], Tensor]:
         """Weighted terms, () each; and the mean absolute color error over tissue, (), that the check watches."""
         cfg, frame = self.cfg, drawn.frame
-        terms = self.method.terms(drawn, cfg, self.ops)
+        terms = self.method.terms(drawn, cfg, self.ops)  # ours: `losses.supervised_terms`
         is_error = self.method.color_is_error
         error = terms["color"] if is_error else color_l1(drawn.out.color.detach(), frame.rgb, frame.tissue_mask)
         if drawn.offsets is not None and state.tracks is not None:
@@ -199,7 +223,7 @@ class TrainingStep:
     def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
         planned = self.method.plan(state.stats, state.gaussians, self.extent, state.stage, iteration, self.cfg)
         if bool(planned.remove.all()):
-            lost = f"after iteration {iteration} all {len(planned.remove):,} faded"
+            lost = f"after iteration {iteration} all {len(planned.remove):,} were removed"
             raise Diverged(f"expected Gaussians that explain the frames; {lost}. {ADVICE}")
         state.stats, parents = density.apply_plan(state.optimizer, planned, state.stats, rng)
         state.tracks = state.tracks and state.tracks.inherited(parents)

@@ -113,7 +113,7 @@ def temporal_terms(
     seen = out.radii > 0
     both = temporal.gradient == "both"
     if both:
-        seen = ops.valid_projection(out.means2d, out.radii, before.tissue_now)
+        seen = ops.valid_projection(out.means2d, out.radii, before.tissue_mask_now)
     eligible = seen & (stats.num_valid >= temporal.min_valid)
     score = stats.score(cfg.released.unobserved_score)
     index, weights = (

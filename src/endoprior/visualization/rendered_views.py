@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Frame
-from ..model.scene import Scene
+from ..model.scene import RenderedScene
 from ..system.atomic import whole_file
 from .camera_paths import View
 from .image_tools import colorize, label, tile, to_u8, write_png
@@ -19,7 +19,9 @@ AT_A_TIME = 8
 """Number of views that a GPU renders in one call."""
 
 
-def write_views(scene: Scene, views: list[View], out: Path, video: Path, frames: Sequence[Frame] | None = None) -> None:
+def write_views(
+    scene: RenderedScene, views: list[View], out: Path, video: Path, frames: Sequence[Frame] | None = None
+) -> None:
     """Write each view to `out/rgb/*.png`, `out/depth/*.npy` (mm, float32) and `out/side_by_side/*.png`, and a video.
 
     Args:
@@ -71,7 +73,7 @@ def file_stem(k: int, frames: Sequence[Frame] | None) -> str:
     return f"{frames[k].index if frames else k:06d}"
 
 
-def depth_span(scene: Scene) -> tuple[float, float]:
+def depth_span(scene: RenderedScene) -> tuple[float, float]:
     """Depth range of nearly all of the first frame, mm: one color scale for all images of a scene."""
     depth = scene.render(0.0).depth.cpu().numpy()
     covered = depth[depth > 0]
