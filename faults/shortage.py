@@ -65,10 +65,10 @@ def _resumed(data: Path, parts: Path, whole: Path) -> Row:
 
 
 def full_disk(work: Path) -> list[Row]:
-    """A disk of 24 MB, filled to the last 100 KB; skipped where none can be mounted."""
+    """A disk of 64 MB, filled to the last 100 KB; skipped where none can be mounted."""
     disk = work / "disk"
     disk.mkdir()
-    with _mounted(disk, "24m") as mounted:
+    with _mounted(disk, "64m") as mounted:
         if not mounted:
             return [Row("disk", "full disk", "not run: mounting a small one needs root", True)]
         data, trained = work / "data", work / "whole"
