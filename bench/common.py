@@ -156,7 +156,6 @@ def rows(
     num: int | None = None,
     picture: tuple[int | None, int | None] = (None, None),
 ) -> list[Row]:
-    """The result of a race as rows named `stage step`."""
     return [Row(f"{stage} {name}".strip(), num, *picture, *values) for name, values in result.items()]
 
 
@@ -220,7 +219,6 @@ def facts() -> dict[str, Any]:
 
 
 def table(measured: list[Row], notes: dict[Row, str] | None = None) -> str:
-    """The rows as text, with a note at the end of those that have one."""
     width = max((len(row.stage) for row in measured), default=0)
     lines = [f"{'stage':{width}}  {'size':>17}  {'ours ms':>9}  {'torch ms':>9}  {'ratio':>7}  {'share':>6}"]
     for row in measured:
@@ -249,7 +247,6 @@ def save(measured: list[Row], file: Path) -> None:
 
 
 def arguments(about: str | None) -> argparse.ArgumentParser:
-    """The options that every benchmark has."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="20,000 Gaussians at 640x512 only")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results there")
@@ -258,26 +255,16 @@ def arguments(about: str | None) -> argparse.ArgumentParser:
 
 
 def set_threads(count: int | None) -> None:
-    """Give Numba and torch the same number of threads, if one was asked for."""
     if count:
         numba.set_num_threads(count)
         torch.set_num_threads(count)
 
 
 def sizes(options: argparse.Namespace) -> tuple[Size, ...]:
-    """What the options ask to measure."""
     return QUICK if options.quick else FULL
 
 
 def report(measured: list[Row], options: argparse.Namespace, notes: dict[Row, str] | None = None) -> None:
-    """Print the rows, and write them where the options say."""
     print(f"{threads()}\n{table(measured, notes)}")
     if options.json:
         save(measured, options.json)
-
-
-def main(measure: Measure, about: str | None) -> None:
-    """Command line of one stage: measure, print, write."""
-    options = arguments(about).parse_args()
-    set_threads(options.threads)
-    report(measure(sizes(options)), options)

@@ -23,15 +23,11 @@ JPEG_QUALITY = 85
 PORT = 8199
 PAGE_SECONDS = 12.0
 """A page drawn without a graphics card takes its time."""
-CLIPS = {
-    "stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97),
-    "mono": ("mono_endo.mp4", None, 169),
-}
+CLIPS = {"stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97), "mono": ("mono_endo.mp4", None, 169)}
 """Video, calibration and the held-out frame that is shown."""
 
 
 def endoprior(*args: object) -> None:
-    """Run one command of the program."""
     subprocess.run([sys.executable, "-m", "endoprior", *map(str, args)], check=True)
 
 
@@ -44,7 +40,6 @@ def save(name: str, picture: np.ndarray) -> None:
 
 
 def report(work: Path) -> None:
-    """The demo's report."""
     if not (work / "demo" / "report.png").exists():
         endoprior("demo", work / "demo")
     save("report.jpg", cv2.imread(str(work / "demo" / "report.png")))
@@ -97,7 +92,6 @@ def pages(work: Path) -> None:
 
 
 def main() -> None:
-    """Make what can be made."""
     work, data = Path(sys.argv[1] if len(sys.argv) > 1 else "figures"), os.environ.get("ENDOPRIOR_DATA")
     work.mkdir(parents=True, exist_ok=True)
     report(work)

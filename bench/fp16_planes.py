@@ -21,7 +21,6 @@ from endoprior.model.scene_file import load_scene
 
 
 def scores(scene: Scene, sequence: FrameSequence) -> np.ndarray:
-    """(F,) tissue PSNR of each test frame, of the rendered color."""
     found = []
     for frame in sequence.frames("test"):
         color = scene.render(frame.time, frame.camera).color.numpy()
@@ -30,7 +29,6 @@ def scores(scene: Scene, sequence: FrameSequence) -> np.ndarray:
 
 
 def main() -> None:
-    """Score both, print the change."""
     run, data = map(Path, sys.argv[1:])
     scene = load_scene(run)
     sequence = load_sequence(data, scored_data(scene.config.data))

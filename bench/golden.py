@@ -33,7 +33,6 @@ CLOCK = ("fps", "fps_cached", "train_seconds", "iterations_per_second")
 
 
 def endoprior(*words: str | Path) -> None:
-    """Run a command; its output is shown only if it fails."""
     done = subprocess.run([sys.executable, "-m", "endoprior", *map(str, words)], capture_output=True, encoding="utf-8")
     if done.returncode:
         sys.exit(f"endoprior {' '.join(map(str, words))}:\n{done.stdout[-2000:]}{done.stderr[-4000:]}")
@@ -48,7 +47,6 @@ def arrays_hash(file: Path) -> str:
 
 
 def main() -> None:
-    """Train, hash, write, compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--against", type=Path)

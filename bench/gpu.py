@@ -39,7 +39,6 @@ DRY_FRAMES, DRY_ITERATIONS = 9, 6
 
 
 def machine(target: Target) -> dict[str, str]:
-    """What a reader of the numbers must know."""
     found = {"commit": str(common.source_commit()), "torch": torch.__version__, "date": time.strftime("%Y-%m-%d")}
     if target.device.type != "cuda":
         return found | {"GPU": "none, on the CPU"}
@@ -54,7 +53,6 @@ def machine(target: Target) -> dict[str, str]:
 
 
 def driver() -> str:
-    """Version of the GPU driver, as nvidia-smi says."""
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
         answer = subprocess.run(query, capture_output=True, encoding="utf-8", check=True, timeout=30).stdout
@@ -102,7 +100,6 @@ def summed(differences: list[Difference]) -> list[Difference]:
 
 
 def use_wheel(wheel: Path) -> None:
-    """Unpack a wheel beside itself and import from there; gsplat builds its kernels from the sources in it, once."""
     folder = wheel.parent / wheel.stem
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(folder)
@@ -110,7 +107,6 @@ def use_wheel(wheel: Path) -> None:
 
 
 def targets(options: argparse.Namespace) -> list[Target]:
-    """The backends to measure: those named, else every GPU backend whose library is installed."""
     if options.dry_run or options.interpreted:
         return [Target("triton" if options.interpreted else "numba", torch.device("cpu"))]
     device = torch.device("cuda", 0)
@@ -119,7 +115,6 @@ def targets(options: argparse.Namespace) -> list[Target]:
 
 
 def arguments() -> argparse.ArgumentParser:
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, metavar="RUN", help="a trained run folder, compared too")
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="sequence to train on (default: a phantom)")
@@ -136,7 +131,6 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Compare, time, train, print, write; 1 if a backend does not agree."""
     options = arguments().parse_args(words)
     if options.wheel:
         use_wheel(options.wheel)

@@ -73,7 +73,6 @@ class Difference:
 
     @property
     def agrees(self) -> bool:
-        """Within the limits."""
         return self.stray <= STRAY_PIXELS[self.kind] and self.gradient <= GRADIENT_LIMIT
 
 
@@ -114,7 +113,6 @@ def trained_cases(run: Path, *, window: bool) -> list[Case]:
 
 
 def cropped(view: Camera) -> Camera:
-    """The camera that sees the middle of another's image."""
     width, height = (min(size, limit) for size, limit in zip((view.width, view.height), WINDOW, strict=True))
     left, top = (view.width - width) // 2, (view.height - height) // 2
     return replace(view, width=width, height=height, cx=view.cx - left, cy=view.cy - top)
@@ -140,12 +138,10 @@ def rendered(backend: render.Backend, device: torch.device, case: Case) -> tuple
 
 
 def on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Copies in float64 on the CPU."""
     return {name: tensor.detach().double().cpu() for name, tensor in tensors.items()}
 
 
 def compared(target: Target, against: render.Backend, case: Case) -> Difference:
-    """Compare the backend with another on one scene."""
     images, grads = rendered(target.backend, target.device, case)
     wanted, wanted_grads = rendered(against, torch.device("cpu"), case)
     off = {name: numbers((images[name] - wanted[name]).abs()) for name in IMAGES}

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import common
-import rendering
 import scenes
 import torch
 from gpu_parity import Target
@@ -19,9 +18,10 @@ from endoprior import render
 from endoprior.core.types import Camera, Splats
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
+PRESETS = ("default", "paper")
 REPEATS, WARM_UP = 50, 5
 TIME = 0.4
 AT_A_TIME = 16
@@ -30,8 +30,6 @@ AT_A_TIME = 16
 
 @dataclass(frozen=True)
 class Timing:
-    """One timing."""
-
     backend: str
     stage: str
     gaussians: int
@@ -45,7 +43,6 @@ class Timing:
 
 
 def median_ms(step: Callable[[], Any], device: torch.device, repeats: int) -> float:
-    """Median milliseconds of a step, measured on the device where it is a GPU."""
     for _ in range(min(WARM_UP, repeats)):
         step()
     if device.type != "cuda":
@@ -77,7 +74,7 @@ def speed(target: Target, sizes: tuple[common.Size, ...], repeats: int) -> list[
             "rendered from cached splats": partial(forward, rasterize, on_device),
             "rendered, with gradients": both_ways(rasterize, on_device),
         }
-        for name in rendering.PRESETS:
+        for name in PRESETS:
             steps[f"deformed ({name}) and rendered"] = deformed(rasterize, name, splats, camera, target.device)
         several = [on_device] * AT_A_TIME
         many = partial(render.load_many(target.backend), cameras=[camera] * AT_A_TIME, background=background)
@@ -90,7 +87,6 @@ def speed(target: Target, sizes: tuple[common.Size, ...], repeats: int) -> list[
 
 
 def timed(target: Target, stage: str, num: int, step: Callable[[], Any], repeats: int) -> Timing:
-    """One row; an error becomes its note."""
     device = target.device
     on_gpu = device.type == "cuda"
     if on_gpu:
@@ -104,7 +100,6 @@ def timed(target: Target, stage: str, num: int, step: Callable[[], Any], repeats
 
 @torch.no_grad()
 def forward(rasterize: Callable[..., Any], splats: Splats | list[Splats]) -> None:
-    """Forward only."""
     rasterize(splats)
 
 
@@ -126,14 +121,14 @@ def deformed(
     rasterize: Callable[..., Any], name: str, splats: Splats, camera: Camera, device: torch.device
 ) -> Callable[[], None]:
     """A preset's deformation at one time, then forward, on the device; the first call moves the scene there."""
-    kept: list[Scene] = []
+    kept: list[SingleScene] = []
 
     def step() -> None:
         if not kept:
             cfg, field = preset(name).fitted(68), None
             if cfg.deformation.kind == "hexplane":
                 field = HexPlaneField.from_points(splats.means, cfg.deformation, torch.Generator().manual_seed(0))
-            scene = rendering.make_scene(splats, camera, cfg, field and field.to(device))
+            scene = scenes.scene(splats, (camera,), cfg, field and field.to(device))
             kept.append(replace(scene, gaussians=scene.gaussians.to(device)))
         forward(rasterize, kept[0].at(TIME))
 

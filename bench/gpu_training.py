@@ -7,14 +7,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 
 from endoprior import render
 from endoprior.core.config import Config
-from endoprior.data import FrameSequence, load_sequence
+from endoprior.data import load_sequence
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
@@ -30,8 +30,6 @@ SCORES = (
 
 @dataclass(frozen=True)
 class Run:
-    """One training."""
-
     name: str
     frames: int = 0
     start_s: float = 0.0
@@ -49,7 +47,6 @@ class Run:
 
 
 def runs_of(backends: list[render.Backend], folder: Path, iterations: int | None) -> Iterator[Run]:
-    """One training on each backend; a second one with Triton, which promises bit-identical results."""
     for backend in backends:
         yield attempt(backend, folder, backend, iterations)
         if backend == "triton":
@@ -76,16 +73,11 @@ def sequence_at(data: Path | None, frames: int, width: int, height: int) -> Iter
 
 
 def config(backend: render.Backend, iterations: int | None) -> Config:
-    """`default` on a backend, with another number of iterations if one is given."""
-    cfg = preset("default")
-    cfg = replace(cfg, render=replace(cfg.render, backend=backend))
+    cfg = preset("default").replace({"render.backend": backend})
     if iterations is None:
         return cfg
-    half = iterations // 3
-    return replace(
-        cfg, schedule=replace(cfg.schedule, fine_iterations=iterations, half_resolution_iterations=half),
-        optim=replace(cfg.optim, decay_iterations=iterations),
-    )  # fmt: skip
+    lengths = {"schedule.fine_iterations": iterations, "optim.decay_iterations": iterations}
+    return cfg.replace(lengths | {"schedule.half_resolution_iterations": iterations // 3})
 
 
 def trained(name: str, folder: Path, backend: render.Backend, iterations: int | None, *, scored: bool) -> Run:
@@ -104,30 +96,23 @@ def trained(name: str, folder: Path, backend: render.Backend, iterations: int | 
     scene = trainer.scene().to(trainer.device)
     wait_for(trainer.device)
     ended = time.perf_counter()
+    found = evaluate(scene, sequence, networks=False).scores if scored else {}
     return Run(
         name=name, frames=len(sequence), start_s=started - began, loop_s=ended - started,
         iterations=cfg.schedule.fine_iterations, bits=digest(scene),
         memory_mb=torch.cuda.max_memory_allocated(trainer.device) / 1e6 if on_gpu else None,
-        scores=scores(scene, sequence) if scored else {},
+        scores={name: found[name] for name in SCORES if name in found},
     )  # fmt: skip
 
 
 def digest(scene: Scene) -> str:
-    """Of all trained numbers of the Gaussians."""
     found = hashlib.sha256()
     for _, value in sorted(scene.gaussians.tensors.items()):
         found.update(value.detach().cpu().contiguous().numpy().tobytes())
     return found.hexdigest()[:12]
 
 
-def scores(scene: Scene, sequence: FrameSequence) -> dict[str, float]:
-    """Some scores of the test split, networks left out."""
-    found = evaluate(scene, sequence, networks=False).scores
-    return {name: found[name] for name in SCORES if name in found}
-
-
 def table(runs: list[Run]) -> list[str]:
-    """Markdown, one row per training."""
     names = [name for name in SCORES if any(name in run.scores for run in runs)]
     facts = ("`default` on", "frames", "start, s", "iterations, s", "iterations/s", "bits")
     lines = header(*facts, *names)
@@ -140,5 +125,4 @@ def table(runs: list[Run]) -> list[str]:
 
 
 def header(*names: str) -> list[str]:
-    """The two first lines of a Markdown table."""
     return [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]

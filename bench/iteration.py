@@ -1,7 +1,5 @@
 """A whole training iteration of the presets `default` and `paper`, beside the same loop with plain torch inside.
 
-`python bench/iteration.py [--quick] [--json FILE]`
-
 The data is a phantom of a few frames. One and the same iteration is repeated: a fine one at full resolution, with all
 degrees of color, with the temporal term, without growth.
 """
@@ -9,7 +7,6 @@ degrees of color, with the temporal term, without growth.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import common
@@ -39,11 +36,7 @@ NEVER = 1_000_000
 TORCH_MOST = common.Size(20_000, 640, 512)
 """With more Gaussians or pixels, autograd's memory takes torch from seconds to minutes."""
 PARTS = {
-    "deformation": [
-        (motion, "basis_offsets"),
-        (HexPlaneField, "offsets"),
-        (HexPlaneField, "offsets_and_displacement"),
-    ],
+    "deformation": [(motion, "basis_offsets"), (HexPlaneField, "offsets"), (HexPlaneField, "offsets_and_displacement")],
     "projection + SH": [(numba_backend, "project_forward")],
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],
@@ -74,7 +67,6 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
 
 
 def rows(name: str, sequence: FrameSequence, size: common.Size) -> list[common.Row]:
-    """The rows of one preset and size."""
     trainer = started(sequence, config(name, size.num))
     repeated = settle(trainer)
     ours = {"": lambda _: repeat(trainer, repeated)}
@@ -88,15 +80,9 @@ def rows(name: str, sequence: FrameSequence, size: common.Size) -> list[common.R
 
 
 def config(name: str, num: int) -> Config:
-    """The preset with `num` Gaussians, every term active at once, and nothing that changes the number."""
-    cfg = preset(name).fitted(68)
-    return replace(
-        cfg,
-        init=replace(cfg.init, budget=num),
-        schedule=replace(cfg.schedule, coarse_iterations=0, half_resolution_iterations=0, sh_every=1),
-        temporal=replace(cfg.temporal, start_iteration=1, min_valid=1),
-        density=replace(cfg.density, start_iteration=NEVER),
-    )
+    changes = {"init.budget": num, "temporal.start_iteration": 1, "temporal.min_valid": 1}
+    changes |= {f"schedule.{stage}_iterations": 0 for stage in ("coarse", "half_resolution")} | {"schedule.sh_every": 1}
+    return preset(name).fitted(68).replace(changes | {"density.start_iteration": NEVER})
 
 
 def started(sequence: FrameSequence, cfg: Config, ops: TrainingOps = NUMBA) -> GaussianTrainer:
@@ -121,10 +107,5 @@ def settle(trainer: GaussianTrainer) -> int:
 
 
 def repeat(trainer: GaussianTrainer, iteration: int) -> StepReport:
-    """Do a fine iteration again: the same frame, the same terms."""
     trainer.state.stage, trainer.state.iteration = Stage.FINE, iteration - 1
     return trainer.step()
-
-
-if __name__ == "__main__":
-    common.main(measure, __doc__)

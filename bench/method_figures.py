@@ -35,14 +35,12 @@ CHECK_WIDTH_PX = 900
 
 
 def figure(columns: int, height: float, ratios: list[float] | None = None) -> tuple[Figure, list]:
-    """A figure with one row of axes."""
     result = Figure(figsize=(WIDTH_INCHES, height), layout="constrained", dpi=110)
     FigureCanvasAgg(result)
     return result, list(np.atleast_1d(result.subplots(1, columns, width_ratios=ratios)))
 
 
 def show(axis: object, image: NDArray, title: str, **options: object) -> object:
-    """An image without ticks."""
     axis.set_title(title, fontsize=9)
     axis.set_axis_off()
     return axis.imshow(image, **options)
@@ -56,7 +54,6 @@ def save(result: Figure, name: str) -> None:
 
 
 def check(data: Path, picture: Path) -> None:
-    """What `endoprior check` draws."""
     figures.endoprior("check", data, "--out", picture)
     image = cv2.imread(str(picture))
     factor = CHECK_WIDTH_PX / image.shape[1]
@@ -123,7 +120,6 @@ def sides(scene: Scene) -> None:
 
 
 def main() -> None:
-    """Make all figures."""
     work = Path(sys.argv[1] if len(sys.argv) > 1 else "figures")
     work.mkdir(parents=True, exist_ok=True)
     (figures.IMAGES / "method").mkdir(exist_ok=True)

@@ -1,7 +1,4 @@
-"""Every operation of model and training in Numba, beside the same operation in PyTorch.
-
-`python bench/ops.py [--quick] [--json FILE]`
-"""
+"""Every operation of model and training in Numba, beside the same operation in PyTorch."""
 
 from __future__ import annotations
 
@@ -133,7 +130,6 @@ def temporal(num: int, ops: TrainingOps) -> common.Steps:
 
 
 def losses(width: int, height: int, ops: TrainingOps) -> common.Steps:
-    """The supervised losses and their gradient."""
     generator = torch.Generator().manual_seed(0)
     color = torch.rand(height, width, 3, generator=generator, requires_grad=True)
     depth = (torch.rand(height, width, generator=generator) * 60 + 40).requires_grad_()
@@ -142,7 +138,3 @@ def losses(width: int, height: int, ops: TrainingOps) -> common.Steps:
     mask = torch.rand(height, width, generator=generator) < 0.9
     given = (target, inverse, mask, mask, (1.0, 1.0, 0.03, 0.5))
     return {"": lambda _: torch.autograd.grad(ops.supervised_losses(color, depth, *given).sum(), (color, depth))}
-
-
-if __name__ == "__main__":
-    common.main(measure, __doc__)

@@ -15,23 +15,20 @@ import time
 from pathlib import Path
 from typing import Any
 
-import binning
 import common
-import compositing
 import iteration
 import ops
-import projection
 import rendering
 import stereo
 import viewer
 from common import Row
 
 STAGES: dict[str, common.Measure] = {
-    "projection": projection.measure,
-    "binning": binning.measure,
-    "compositing": compositing.measure,
+    "projection": rendering.projection,
+    "binning": rendering.binning,
+    "compositing": rendering.compositing,
     "ops": ops.measure,
-    "rendering": rendering.measure,
+    "rendering": rendering.rendering,
     "stereo": stereo.measure,
     "viewer": viewer.measure,
     "iteration": iteration.measure,
@@ -45,14 +42,12 @@ MIN_MS = 0.5
 
 
 def load_ratios(file: Path) -> Ratios:
-    """Ratios of a JSON file by `key`."""
     stored = json.loads(file.read_text(encoding="utf-8"))["rows"]
     rows = [Row(**{k: v for k, v in row.items() if k != "ratio"}) for row in stored]
     return {key(row): row.ratio for row in rows if row.ratio is not None}
 
 
 def key(row: Row) -> tuple[Any, ...]:
-    """What names a row: stage and size."""
     return row.stage, row.gaussians, row.width, row.height
 
 
@@ -62,7 +57,6 @@ def changes(rows: list[Row], baseline: Ratios) -> dict[Row, float]:
 
 
 def worse(changed: dict[Row, float], factor: float) -> list[Row]:
-    """The rows that count as slower."""
     return [row for row, change in changed.items() if change > factor and row.ours_ms >= MIN_MS]
 
 
@@ -76,7 +70,6 @@ def measure(stage: str, sizes: tuple[common.Size, ...], baseline: Ratios, factor
 
 
 def main() -> int:
-    """Measure, print, write, compare; 1 if anything is slower."""
     parser = common.arguments(__doc__)
     parser.add_argument("--only", nargs="+", choices=STAGES, default=list(STAGES), metavar="STAGE")
     parser.add_argument("--baseline", type=Path, metavar="FILE", help="an earlier --json FILE")

@@ -11,6 +11,8 @@ from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, Splats
 from endoprior.model.gaussians import Gaussians, motion_shape
+from endoprior.model.hexplane_field import HexPlaneField
+from endoprior.model.single_scene import SingleScene
 
 FOCAL_PER_WIDTH = 0.9
 """Of an endoscope; also the phantom's."""
@@ -19,7 +21,6 @@ SIGMA_PX = 2.6
 
 
 def camera(width: int, height: int) -> Camera:
-    """A camera at the origin that looks along z."""
     focal = FOCAL_PER_WIDTH * width
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
@@ -62,8 +63,13 @@ def gaussians(drawn: Splats, cfg: Config) -> Gaussians:
     return Gaussians({name: value.clone() for name, value in tensors.items()})
 
 
+def scene(drawn: Splats, cameras: tuple[Camera, ...], cfg: Config, field: HexPlaneField | None = None) -> SingleScene:
+    """A scene that shows `drawn`; without a field it stands still, but deforming costs the same as if it moved."""
+    nothing = torch.zeros(len(drawn))
+    return SingleScene(gaussians(drawn, cfg), field, cfg, cameras, 25.0, nothing, nothing)
+
+
 def sheet(num: int, seed: int = 0) -> Tensor:
-    """(N, 3) points, mm, on a bumpy sheet of 60 x 50 mm, as Gaussians lie on tissue."""
     points = torch.rand(num, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([60.0, 50.0, 0.5])
     points[:, 2] += 60 + 8 * torch.sin(points[:, 0] / 9) * torch.cos(points[:, 1] / 7)
     return points[torch.from_numpy(morton_order(points.numpy()))]

@@ -49,7 +49,6 @@ class Launches(TorchDispatchMode):
 
 
 def trainer_of(name: str, folder: Path, ops: TrainingOps = NUMBA, **changes: int) -> GaussianTrainer:
-    """A started trainer of a preset in which every term is active at once, without density events."""
     cfg = preset(name)
     cfg = replace(
         cfg,
@@ -64,7 +63,6 @@ def trainer_of(name: str, folder: Path, ops: TrainingOps = NUMBA, **changes: int
 
 
 def median_ms(trainer: GaussianTrainer) -> float:
-    """Of the counted iterations."""
     taken = []
     for _ in range(UNCOUNTED + COUNTED):
         began = time.perf_counter()
@@ -74,8 +72,6 @@ def median_ms(trainer: GaussianTrainer) -> float:
 
 
 def launches(name: str, folder: Path) -> int:
-    """Operations of an iteration with every term; the picture is a stand-in of a few."""
-
     def picture(splats, camera, *, background, depth_grad_to_means=True) -> RenderOutput:
         means2d = splats.means[:, :2] * 1.0
         tied = means2d.sum() + sum(getattr(splats, n).sum() for n in ("quats", "scales", "opacities", "sh"))
@@ -93,7 +89,6 @@ def launches(name: str, folder: Path) -> int:
 
 
 def main() -> None:
-    """Print one line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", default="default")
     parser.add_argument("--launches", action="store_true")

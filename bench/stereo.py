@@ -1,7 +1,4 @@
-"""Depth from two eyes: the whole of it, and its parts.
-
-`python bench/stereo.py [--quick] [--json FILE]`
-"""
+"""Depth from two eyes: the whole of it, and its parts."""
 
 from __future__ import annotations
 
@@ -40,7 +37,3 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
         measured += common.rows("stereo", common.race(steps), None, (width, height))
         measured += common.part_rows("stereo", steps, PARTS, common.Size(None, width, height))
     return measured
-
-
-if __name__ == "__main__":
-    common.main(measure, __doc__)

@@ -21,8 +21,6 @@ import numpy as np
 import torch
 import yaml
 
-from endoprior.core.config import Config
-from endoprior.core.config_io import from_dict, override, to_dict
 from endoprior.data import load_sequence
 from endoprior.model.presets import preset
 from endoprior.training import losses
@@ -68,17 +66,15 @@ def measure(trainer: GaussianTrainer) -> dict[int, dict[str, float]]:
 
 
 def main() -> None:
-    """Measure one preset on one sequence."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE")
     args = parser.parse_args()
-    values = to_dict(preset(args.preset, seed=args.seed))
     changes = (text.partition("=") for text in args.set)
-    override(values, {name: yaml.safe_load(value) for name, _, value in changes}, "--set")
-    cfg = from_dict(Config, values)
+    changed = {name: yaml.safe_load(value) for name, _, value in changes}
+    cfg = preset(args.preset, seed=args.seed).replace(changed)
     by_iteration = measure(GaussianTrainer(load_sequence(args.data, cfg.data), cfg))
     names = sorted({name for terms in by_iteration.values() for name in terms})
     print("iteration".ljust(12), *(name.rjust(12) for name in names))

@@ -72,7 +72,6 @@ def compare(name: str, sequence: FrameSequence, preset_name: str, seed: int) -> 
 
 
 def main() -> None:
-    """Train on both phantoms and exit with 1 if tracks suffer."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--preset", default="default")
     parser.add_argument("--seeds", type=int, default=1)

@@ -17,13 +17,11 @@ import common
 import cv2
 import msgspec
 import scenes
-import torch
 import zstandard
 from websockets.sync.client import connect
 
 import endoprior.view.server as server_module
 from endoprior.model.presets import preset
-from endoprior.model.single_scene import SingleScene
 from endoprior.view import browsers
 from endoprior.view.panel import control_id
 from endoprior.view.viewable import IDLE_SECONDS, ViewSettings
@@ -123,12 +121,9 @@ def work(viewer: server_module.Viewer, stop: threading.Event) -> None:
 
 
 def make_viewable(size: common.Size) -> ViewableScene:
-    """A scene of FRAMES frames that stands still; deforming costs the same as if it moved."""
+    """A scene of FRAMES frames."""
     splats, camera = scenes.splats(size)
-    cfg = preset("default").fitted(68)
-    nothing = torch.zeros(len(splats))
-    scene = SingleScene(scenes.gaussians(splats, cfg), None, cfg, (camera,) * FRAMES, 25.0, nothing, nothing)
-    return ViewableScene(scene, "bench")
+    return ViewableScene(scenes.scene(splats, (camera,) * FRAMES, preset("default").fitted(68)), "bench")
 
 
 if __name__ == "__main__":

@@ -6,22 +6,20 @@ nothing and changes nothing.
 
 from __future__ import annotations
 
-import corpus_numbers
 import corpus_options
 import corpus_prepare
 import corpus_runs
 import corpus_sequences
-import corpus_surroundings
 import corpus_videos
 from corpus_case import Case
 
 KINDS = {
     "sequences": corpus_sequences.CASES,
-    "poses and facts": corpus_numbers.CASES,
+    "poses and facts": corpus_sequences.NUMBERS,
     "videos": corpus_videos.CASES,
     "beside a video": corpus_prepare.CASES,
     "options and outputs": corpus_options.CASES,
     "runs and specs": corpus_runs.CASES,
-    "around the data": corpus_surroundings.CASES,
+    "around the data": corpus_options.SURROUNDINGS,
 }
 CASES: list[Case] = [case for cases in KINDS.values() for case in cases]

@@ -34,7 +34,6 @@ class Samples:
 
     @cached_property
     def run(self) -> Path:
-        """A run folder, hardly trained on `sequence`, checkpoint included."""
         from endoprior.cli import main
 
         options = "--init-budget 200 --schedule.coarse-iterations 1 --schedule.fine-iterations 3 --no-networks"
@@ -56,7 +55,6 @@ class Samples:
         return write_video(self.folder / "clip.mkv", pictures)
 
     def copy(self, name: str, target: Path) -> Path:
-        """A copy of a sample at `target`."""
         source: Path = getattr(self, name)
         if source.is_dir():
             shutil.copytree(source, target)

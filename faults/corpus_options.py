@@ -70,12 +70,10 @@ def one_value(command: str, needs: str, option: str, value: str) -> Case:
 
 
 def with_run(name: str, command: str | list[str], *says: str) -> Case:
-    """A command on a sound run."""
     return Case(name, given(command, needs="run"), says)
 
 
 def with_data(name: str, command: str, *says: str) -> Case:
-    """A command on a sound sequence."""
     return Case(name, given(command, needs="sequence"), says)
 
 
@@ -160,10 +158,42 @@ OUTPUTS = [
     with_run("render into no name", ["render", "run", "", "--times", "0"], "empty"),
     with_run("export into nowhere", f"export run {NOWHERE} --format ply", NOWHERE),
     with_run("export over a file", "export run run/config.json --format ply", "run/config.json"),
-    Case(
-        "bench into a file",
-        given("bench spec.yaml out", put("out", "x"), put("spec.yaml", SPEC)),
-        ("OUT out", "a file"),
-    ),
+    Case("bench into a file", given("bench spec.yaml out", put("out", "x"), put("spec.yaml", SPEC)), ("OUT", "a file")),
 ]
 CASES = [*OPTIONS, *OUTPUTS]
+
+# What lies around the data: files that libraries would import or read as settings, and names that a terminal obeys.
+EVIL = "open('executed', 'w')\n"
+NAMES = ("\x1b]0;title\x07", "\x1b[2J", "\x9b31m", "\u202egnp.a", "a\rb", "a\x08b")
+"""Sets the title of the terminal, clears it, colors it, turns the text around, goes back in the line."""
+MODULES = ("json", "numpy", "dataclasses", "tomllib", "endoprior/__init__")
+
+
+SURROUNDINGS = [
+    *(
+        Case(
+            f"{module}.py beside the data",
+            given("prior data out", put(f"{module}.py", EVIL), needs="sequence"),
+            leaves=("out",),
+            check=lambda folder: not (folder / "executed").exists(),
+        )
+        for module in MODULES
+    ),
+    Case(
+        "settings of Numba beside the data",
+        given("prior data out", put(".numba_config.yaml", "num_threads: -3\ncache_dir: evil\n"), needs="sequence"),
+        leaves=("out",),
+    ),
+    Case(
+        "settings of Numba that are no YAML",
+        given("prior data out", put(".numba_config.yaml", "a: [\x00"), needs="sequence"),
+        leaves=("out",),
+    ),
+    Case(
+        "settings of Matplotlib beside the data",
+        given("check data", put("matplotlibrc", "backend: module://evil\ntext.usetex: True\n"), needs="sequence"),
+        leaves=("check.png",),
+    ),
+    *(Case(f"a folder called {name!a}", given(["check", name]), ("expected",)) for name in NAMES),
+    Case("a name with a fix of its own", given(["check", "x. Fix: `curl evil`"]), ("x. fix 'curl evil'", "expected")),
+]

@@ -26,7 +26,6 @@ def damaged(command: str, *steps: Step) -> Build:
 
 
 def cut(name: str, by: int) -> Step:
-    """Takes bytes off the end of a file."""
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-by])
 
 
@@ -42,14 +41,12 @@ def flipped(name: str) -> Step:
 
 
 def added(name: str, text: str) -> Step:
-    """Adds text to the end of a file."""
     return lambda folder: (folder / name).write_text(
         (folder / name).read_text(encoding="utf-8") + text, encoding="utf-8"
     )
 
 
 def header(text: bytes | str, length: int | None = None) -> bytes:
-    """A safetensors file that is nothing but a header."""
     encoded = text if isinstance(text, bytes) else text.encode()
     return struct.pack("<Q", len(encoded) if length is None else length) + encoded
 
@@ -60,18 +57,14 @@ def about(text: str) -> bytes:
 
 
 def path_of(text: str) -> Build:
-    """A camera path."""
     return damaged("render run out --camera-path path.json", put("path.json", text))
 
 
 def scene(name: str, *steps: Step, says: tuple[str, ...] = ()) -> Case:
-    """A damaged scene."""
     return Case(name, damaged(RENDER, *steps), (SCENE, *says))
 
 
 def config(name: str, content: bytes | str | Callable[[dict], object], *says: str) -> Case:
-    """A run's config.json of these bytes, or changed."""
-
     def damage(folder: Path) -> None:
         facts = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         content(facts)
@@ -81,7 +74,6 @@ def config(name: str, content: bytes | str | Callable[[dict], object], *says: st
 
 
 def resumed(name: str, *steps: Step, says: tuple[str, ...] = (), options: str = "") -> Case:
-    """A training that cannot be resumed."""
     return Case(name, damaged(f"{RESUME} {options}", *steps), (CHECKPOINT, *says), ("run",))
 
 
@@ -114,7 +106,7 @@ RUNS = [
     config("a config with an impossible path", lambda c: c["data"].update(path="\0" + "x" * 5000), "xxx"),
     Case("a pipe for a config", damaged(EVAL, pipe(CONFIG)), ("config.json",)),
     Case("other data", given(f"{EVAL} --data other", put("other/images/a.png", "x"), needs="run"), ("other",)),
-    resumed("nothing to resume", without(CHECKPOINT), without(CONFIG)),
+    Case("nothing to resume", damaged(RESUME, without(CHECKPOINT), without(CONFIG)), (CONFIG, "a run"), ("run",)),
     resumed("a checkpoint cut short", cut(CHECKPOINT, 100)),
     resumed("a checkpoint with one bit flipped", flipped(CHECKPOINT), says=("the bits that were written",)),
     resumed("a checkpoint of noise", put(CHECKPOINT, BYTES * 20)),
@@ -129,11 +121,7 @@ RUNS = [
     Case("a log broken inside", damaged(RESUME, added(LOG, "{\n{}\n")), ("log.jsonl, line", "'{'"), ("run",)),
     resumed("another config", options="--seed 7", says=("seed",)),
     resumed("other data to resume", without("data/sequence.json"), says=("other data",)),
-    Case(
-        "a camera path that is nowhere",
-        given("render run out --camera-path path.json", needs="run"),
-        ("path.json",),
-    ),
+    Case("a camera path that is nowhere", given("render run out --camera-path path.json", needs="run"), ("path.json",)),
     *(
         Case(f"a camera path {what}", path_of(text), ("path.json",))
         for what, text in {
@@ -152,15 +140,15 @@ sequences: {clip: {path: data}}
 methods: {ours: {}}
 seeds: [0]
 """
+CLAIM, TAG = "{score: psnr, method: ours, than: ours, by: .nan}", "!!python/object/apply:os.system ['touch executed']"
+MANY = SOUND.replace("[0]", str(list(range(400)))) + f"budgets: {list(range(1, 301))}"
 
 
 def spec(text: bytes | str, name: str = "spec.yaml") -> Build:
-    """A spec, reported on only, so that nothing is trained."""
     return given(f"bench {name} out --report-only", put(name, text))
 
 
 def changed(old: str, new: str) -> Build:
-    """A sound spec with one thing changed."""
     assert old in SOUND
     return spec(SOUND.replace(old, new))
 
@@ -173,11 +161,7 @@ SPECS = [
     Case("a spec of bytes", spec(bytes(range(256))), ("spec.yaml",)),
     Case("a spec that is a list", spec("[1]"), ("spec.yaml",)),
     Case("a spec whose aliases explode", spec(SOUND + BOMB), ("spec.yaml", "aliases")),
-    Case(
-        "a spec that executes",
-        spec("title: !!python/object/apply:os.system ['touch executed']"),
-        ("spec.yaml", "python/object"),
-    ),
+    Case("a spec that executes", spec(f"title: {TAG}"), ("spec.yaml", "python/object")),
     Case("a spec nested without end", spec(NESTED), ("spec.yaml", "nested")),
     Case("a spec that contains itself", spec("a: &a {b: *a}"), ("spec.yaml", "itself")),
     Case("a TOML spec nested without end", spec("a = " + NESTED, "spec.toml"), ("spec.toml",)),
@@ -189,33 +173,19 @@ SPECS = [
     Case("seeds of NaN", changed("[0]", "[.nan]"), ("spec.yaml", "seeds")),
     Case("seeds below 0", changed("[0]", "[-1]"), ("spec.yaml", "seed")),
     Case("seeds twice", changed("[0]", "[1, 1]"), ("spec.yaml", "seeds")),
-    Case(
-        "more cells than can be run",
-        spec(SOUND.replace("[0]", str(list(range(400)))) + f"budgets: {list(range(1, 301))}"),
-        ("spec.yaml", "120000"),
-    ),
+    Case("more cells than can be run", spec(MANY), ("spec.yaml", "120000")),
     Case("a budget below 0", spec(SOUND + "budgets: [-5]"), ("spec.yaml", "budget")),
-    Case(
-        "a claim by NaN",
-        spec(SOUND + "claims: [{score: psnr, method: ours, than: ours, by: .nan}]"),
-        ("spec.yaml", "by"),
-    ),
+    Case("a claim by NaN", spec(f"{SOUND}claims: [{CLAIM}]"), ("spec.yaml", "by")),
     Case("a setting of NaN", spec(SOUND + "set: {temporal.weight: .nan}"), ("spec.yaml", "weight")),
     Case("a setting that is no field", spec(SOUND + "set: {os.system: 1}"), ("spec.yaml", "os.system")),
     Case(
-        "a phantom beyond all bounds",
-        changed("{path: data}", "{phantom: {frames: 1000000000}}"),
-        ("spec.yaml", "frames"),
+        "a phantom beyond all bounds", changed("path: data", "phantom: {frames: 1000000000}"), ("spec.yaml", "frames")
     ),
     Case("a preset nobody knows", changed("{ours: {}}", "{ours: {preset: finest}}"), ("spec.yaml", "finest")),
     Case("a spec that extends itself", spec(SOUND + "extends: [spec.yaml]"), ("spec.yaml", "extend itself")),
     Case("a spec that extends a device", spec(SOUND + "extends: [/dev/zero]"), ("/dev/zero",)),
     Case("a field nobody knows", spec(SOUND + "colour: red"), ("spec.yaml", "colour")),
-    Case(
-        "a pipe for a spec",
-        given("bench spec.yaml out", pipe("spec.yaml")),
-        ("spec.yaml", "pipe"),
-    ),
+    Case("a pipe for a spec", given("bench spec.yaml out", pipe("spec.yaml")), ("spec.yaml", "pipe")),
     Case("a variable that is not set", changed("path: data", "path: $NO_SUCH_VARIABLE/data"), leaves=("out",)),
 ]
 CASES = [*RUNS, *SPECS]

@@ -1,4 +1,4 @@
-"""Sequence folders of every layout, broken in every way that has been thought of."""
+"""Sequence folders of every layout, their poses and facts, broken in every way that has been thought of."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from corpus_bombs import jpeg_bomb, jpeg_of_two_sizes, tiff_bomb
 from corpus_case import Case, given
 from corpus_damage import (
     CHECK,
     DRAWS,
     FLIPPED,
+    HALF_EXR,
     HALF_JPEG,
     IMAGE,
     NESTED,
@@ -23,18 +23,28 @@ from corpus_damage import (
     Step,
     closed,
     damaged,
+    described,
     empty_folder,
+    entry,
     everywhere,
+    executing_pickle,
     first_frames,
     instead,
+    jpeg_bomb,
+    jpeg_of_two_sizes,
     link,
     lying_npy,
     made,
+    npy,
+    npz_bomb,
+    pickled_npy,
     picture,
     pipe,
     png_bomb,
+    poses,
     put,
     sized,
+    tiff_bomb,
     whole_npy,
     without,
 )
@@ -80,13 +90,11 @@ def stereomis(data: Path) -> None:
 
 
 def everywhere_npy(value: float) -> Step:
-    """Depth of one value in all files of a plain folder."""
     content = whole_npy(np.full((40, 48), value, np.float32))
     return lambda data: [put(f"depth/{i}.npy", content)(data) for i in range(3)]
 
 
 def changed(name: str, old: str, new: str) -> Step:
-    """Replaces text in a file."""
     return lambda data: (data / name).write_bytes((data / name).read_bytes().replace(old.encode(), new.encode()))
 
 
@@ -98,18 +106,23 @@ def narrow(data: Path) -> None:
 
 
 TRAIN = "train data out"
+LENS, SPLIT = "intrinsics.txt", "split.json"
+FIRST, LAST = "images/000000.png", "frame_data000001.json"
 SHORT = f"{TRAIN} --init-budget 100 --schedule.coarse-iterations 2 --schedule.fine-iterations 3 --no-networks"
 MASKED = everywhere("masks", np.full((40, 48), 255, np.uint8))
 PLAIN = sized(48, 40, True)
-BAD_POSE = {"camera-calibration": {"KL": np.eye(3).tolist()}, "camera-pose": np.full((4, 4), np.nan).tolist()}
-LAST_FACTS, LAST_Q = "data/frame_data/frame_data000001.json", "data/reprojection_data/frame_data000001.json"
+BAD_POSE = json.dumps({"camera-calibration": {"KL": np.eye(3).tolist()}, "camera-pose": [[np.nan] * 4] * 4})
+LAST_FACTS, LAST_Q = f"data/frame_data/{LAST}", f"data/reprojection_data/{LAST}"
+HUGE_Q = '{"reprojection-matrix": [[1' + "0" * 400 + "]]}"
+NAN_POSES, NAN_LENS = "\n".join([",".join(["nan"] * 16)] * 2), "nan 0 1\n0 nan 1\n0 0 1"
+DEEP_NPY = lying_npy("(40, 48000000000)", "'<f4'")
+UNMEASURED = everywhere("depth", np.zeros((40, 48), np.uint16))
 NARROW_TIFF, WIDE_TIFF = struct.pack("<HHII", 256, 3, 1, 48), struct.pack("<HHII", 256, 4, 1, 1 << 24)
 LYING_TIFF = cv2.imencode(".tiff", NOISE)[1].tobytes().replace(NARROW_TIFF, WIDE_TIFF)
 ALPHABETS, NO_TEXT = "dé tà\n☃ 'x'", os.fsdecode(b"\xff\xfe")
 
 
 def moved(name: str) -> Step:
-    """Gives the sequence another name."""
     return lambda folder: (folder / "data").rename(folder / name)
 
 
@@ -150,18 +163,9 @@ PICTURES = [
     Case("a bit flipped", damaged(put(IMAGE, FLIPPED)), (IMAGE, "cannot be decoded")),
     Case("half a JPEG called .png", damaged(put(IMAGE, HALF_JPEG)), (IMAGE, "cannot be decoded")),
     Case("a decompression bomb", damaged(put(IMAGE, png_bomb())), (IMAGE, "60000x60000")),
-    Case(
-        "a bomb as the first picture",
-        damaged(put("images/000000.png", png_bomb(40000, 30000))),
-        ("images/000000.png", "40000x30000"),
-    ),
+    Case("a bomb as the first picture", damaged(put(FIRST, png_bomb(40000, 30000))), (FIRST, "40000x30000")),
     Case("a mask that is a bomb", damaged(put("masks/000003.png", png_bomb())), ("masks/000003.png", "60000x60000")),
-    Case(
-        "a promise of 9 Mpx not kept",
-        damaged(put(IMAGE, png_bomb(3000, 3000))),
-        (IMAGE, "cannot be decoded"),
-        noise="libpng",
-    ),
+    Case("a promise of 9 Mpx not kept", damaged(put(IMAGE, png_bomb(3000, 3000))), (IMAGE, "decoded"), noise="libpng"),
     Case("a TIFF that promises too much", damaged(put(IMAGE, LYING_TIFF)), (IMAGE, "16777216x40")),
     Case("a JPEG of 4 Gpx in 2 KB", damaged(put(IMAGE, jpeg_bomb())), (IMAGE, "65500x65500")),
     Case("a JPEG of two sizes", damaged(put(IMAGE, jpeg_of_two_sizes())), (IMAGE, "cannot be decoded")),
@@ -174,11 +178,7 @@ PICTURES = [
     Case("a colored mask", damaged(picture("masks/000003.png", NOISE)), ("masks/000003.png", "one channel")),
     Case("tools everywhere, checked", damaged(MASKED, command=f"{CHECK} --strict"), ("data", "no errors"), DRAWS),
     Case("tools everywhere, trained", damaged(MASKED, command=TRAIN), ("masks", "tissue")),
-    Case(
-        "no depth at all",
-        damaged(everywhere("depth", np.zeros((40, 48), np.uint16)), command=TRAIN),
-        ("depth", "depth > 0"),
-    ),
+    Case("no depth at all", damaged(UNMEASURED, command=TRAIN), ("depth", "depth > 0")),
     Case("depth of NaN", made(PLAIN, everywhere_npy(np.nan), command=TRAIN), ("depth", "depth > 0")),
     Case("depth as a color map", damaged(picture("depth/000003.png", NOISE)), ("depth/000003.png", "one channel")),
     Case("depth of infinity", made(PLAIN, everywhere_npy(np.inf), command=TRAIN), ("depth", "depth > 0")),
@@ -190,53 +190,73 @@ PICTURES = [
 LAYOUTS = [
     Case("a raw SCARED keyframe", made(put("data/frame_data.tar.gz", b"x")), ("frame_data", "SCARED")),
     Case("SCARED without disparity", made(scared, without("data/disparity")), ("disparity",)),
-    Case(
-        "SCARED with a pose of NaN",
-        made(scared, put(LAST_FACTS, json.dumps(BAD_POSE))),
-        ("frame_data000001.json", "camera-pose", "NaN"),
-    ),
-    Case("SCARED nested without end", made(scared, put(LAST_FACTS, NESTED)), ("frame_data000001.json",)),
-    Case(
-        "SCARED with a huge number",
-        made(scared, put(LAST_Q, '{"reprojection-matrix": [[1' + "0" * 400 + "]]}")),
-        ("frame_data000001.json", "reprojection-matrix"),
-    ),
+    Case("SCARED with a pose of NaN", made(scared, put(LAST_FACTS, BAD_POSE)), (LAST, "camera-pose", "NaN")),
+    Case("SCARED nested without end", made(scared, put(LAST_FACTS, NESTED)), (LAST,)),
+    Case("SCARED with a huge number", made(scared, put(LAST_Q, HUGE_Q)), (LAST, "reprojection-matrix")),
     Case("C3VD without a depth", made(c3vd, without("0001_depth.tiff")), ("0001_depth.tiff",)),
     Case("C3VD with words for poses", made(c3vd, put("pose.txt", "a,b,c")), ("pose.txt", "rows of numbers")),
-    Case(
-        "C3VD with poses of NaN",
-        made(c3vd, put("pose.txt", "\n".join([",".join(["nan"] * 16)] * 2))),
-        ("pose.txt", "NaN"),
-    ),
-    Case(
-        "C3VD with a lens that is none", made(c3vd, changed("config.ini", "a2 = -0.02", "a2 = 1e300")), ("data", "fx")
-    ),
+    Case("C3VD with poses of NaN", made(c3vd, put("pose.txt", NAN_POSES)), ("pose.txt", "NaN")),
+    Case("C3VD with a lens that is none", made(c3vd, changed("config.ini", "-0.02", "1e300")), ("data", "fx")),
     Case("C3VD of another size", made(c3vd, without("config.ini")), ("0_color.png", "1350x1080")),
     Case("Hamlyn without a camera", made(hamlyn, without("intrinsics.txt")), ("intrinsics.txt",)),
-    Case(
-        "Hamlyn with a camera of NaN",
-        made(hamlyn, put("intrinsics.txt", "nan 0 1\n0 nan 1\n0 0 1")),
-        ("intrinsics.txt", "camera matrix"),
-    ),
+    Case("Hamlyn with a camera of NaN", made(hamlyn, put(LENS, NAN_LENS)), (LENS, "camera matrix")),
     Case("Forplane, too narrow", damaged(narrow), ("poses_bounds.npy", "30x40 px", "48x40")),
     Case("a raw StereoMIS sequence", made(put("StereoCalibration.ini", "x")), ("StereoCalibration.ini", "prepare")),
     Case(
-        "StereoMIS with a split of its own",
-        damaged(stereomis, put("split.json", '{"test_indices": [0]}')),
-        ("split.json", "test_indices"),
+        "StereoMIS with other splits", damaged(stereomis, put(SPLIT, '{"test_indices": [0]}')), (SPLIT, "test_indices")
     ),
     Case("StereoMIS with a lying camera", damaged(stereomis, put("intrinsics.npy", lying_npy())), ("intrinsics.npy",)),
     Case("a STIR clip without depth", made(put("segmentation/icgstartseg.png", b"x")), ("data", "prepare")),
-    Case(
-        "plain with depth as a bomb",
-        made(PLAIN, put("depth/2.npy", lying_npy("(40, 48000000000)", "'<f4'"))),
-        ("depth/2.npy", "64 bytes"),
-    ),
-    Case(
-        "plain with half an EXR",
-        made(PLAIN, without("depth/2.npy"), put("depth/2.exr", b"v/1\x01\x02\0\0\0channels\0")),
-        ("depth/2.exr",),
-    ),
+    Case("plain with depth as a bomb", made(PLAIN, put("depth/2.npy", DEEP_NPY)), ("depth/2.npy", "64 bytes")),
+    Case("plain with half an EXR", made(PLAIN, without("depth/2.npy"), put("depth/2.exr", HALF_EXR)), ("depth/2.exr",)),
     Case("plain, sound", made(PLAIN), leaves=DRAWS, check=lambda f: (f / "check.png").stat().st_size > 1000),
+]
+POSES, FACTS = "poses_bounds.npy", "sequence.json"
+
+
+def stored(name: str, path: str, content: bytes | str, *says: str) -> Case:
+    return Case(name, damaged(put(path, content)), (path, *says))
+
+
+NUMBERS = [
+    Case("no poses", damaged(without(POSES)), (POSES, "no such file")),
+    Case("poses of another length", damaged(poses(lambda p: p[:5])), (POSES, "(17, 17)", "(5, 17)")),
+    Case("NaN in a pose", damaged(entry(3, 1, np.nan)), (POSES, "NaN")),
+    Case("infinity in a pose", damaged(entry(3, 8, np.inf)), (POSES, "infinity")),
+    Case("a pose that scales", damaged(entry(2, 0, 2.0)), (POSES, "rotations", "row 2")),
+    Case("a pose that mirrors", damaged(entry(2, 0, -1.0)), (POSES, "rotations", "row 2")),
+    Case("a camera beyond all bounds", damaged(entry(2, 3, 1e300)), ("data", "1e+300 mm", "frame 2")),
+    Case("a focal length of 0 in a pose", damaged(entry(0, 14, 0.0), described(fx=None)), (POSES, "focal")),
+    stored("poses in a pickle", POSES, executing_pickle(), "pickle"),
+    stored("poses as objects", POSES, pickled_npy(), "pickle"),
+    stored("an empty file of poses", POSES, b"", "empty"),
+    stored("a shape of terabytes", POSES, lying_npy(), "64 bytes"),
+    stored("a negative shape", POSES, lying_npy("(-17, 17)"), "-17"),
+    stored("a shape of words", POSES, lying_npy("('a', 'b')"), "shape"),
+    stored("a header nested without end", POSES, npy("-" * 9000 + "1")),
+    stored("a header that is code", POSES, npy("__import__('os').system('touch executed')")),
+    Case("a record in place of numbers", damaged(poses(lambda p: np.zeros(17, [("a", "f8")]))), (POSES,)),
+    Case("words in place of numbers", damaged(poses(lambda p: np.full((17, 17), "x"))), (POSES, "finite")),
+    Case(
+        "an archive that unfolds to 2 GB",
+        damaged(lambda d: (d / POSES).write_bytes(npz_bomb())),  # made late: it takes seconds
+        (POSES, "1024 MB"),
+    ),
+    stored("an archive cut short", POSES, b"PK\x03\x04" + bytes(50), "zip"),
+    stored("facts that are not JSON", FACTS, "{", "JSON"),
+    stored("facts that are a list", FACTS, "[1]", "list"),
+    stored("facts nested without end", FACTS, NESTED, "JSON"),
+    stored("facts of bytes", FACTS, bytes(range(256)), "JSON"),
+    stored("a number of 5000 digits", FACTS, '{"fx": ' + "9" * 5000 + "}", "digits"),
+    stored("a focal length of 10^400", FACTS, '{"fx": 1' + "0" * 400 + "}", "fx"),
+    Case("a focal length of NaN", damaged(described(fx=float("nan"))), (FACTS, "fx", "nan")),
+    Case("a focal length of 1e300", damaged(described(fx=1e300)), (FACTS, "fx", "1e+300")),
+    Case("a focal length in words", damaged(described(fx="fifty")), (FACTS, "fx", "fifty")),
+    Case("facts of another size", damaged(described(width=640, height=512)), (FACTS, "48x40", "640x512")),
+    Case("a unit nobody knows", damaged(described(depth_unit="inch")), (FACTS, "depth_unit", "inch")),
+    Case("a format from the future", damaged(described(format_version=99)), (FACTS, "format_version")),
+    Case("a depth scale of infinity", damaged(described(depth_scale=float("inf"))), (FACTS, "depth_scale")),
+    Case("frames that are not there", damaged(described(unexplained_frames=[99])), (FACTS, "99")),
+    Case("a mask value nobody knows", damaged(described(mask_tool_value=7)), (FACTS, "mask_tool_value")),
 ]
 CASES = [*FOLDERS, *PICTURES, *LAYOUTS]

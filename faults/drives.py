@@ -15,8 +15,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from harness import ENVIRONMENT, Row, demand, run, small_sequence
-from kills import arguments
+from harness import ENVIRONMENT, Row, demand, run, small_sequence, training
 
 GONE = ("ESTALE", "ETIMEDOUT", "ENXIO", "EIO", "ENOTCONN")
 OPENS_BEFORE = (0, 2, 10, 60)
@@ -42,7 +41,6 @@ class Drive:
 
 
 def failures(work: Path) -> dict[str, list]:
-    """For each command, how often the drive was gone, and how it ended otherwise than it must."""
     from endoprior.cli import main
 
     drive, out, found = Drive(work / "drive"), work / "drive" / "out", {}
@@ -50,7 +48,7 @@ def failures(work: Path) -> dict[str, list]:
     for words in (
         ["check", data, "--out", f"{out}.png"],
         ["prior", data, str(out)],
-        [str(word) for word in arguments(data, out, 20)],
+        [str(word) for word in training(data, out, 20)],
         ["eval", trained, "--no-networks"],
         ["render", trained, str(out)],
         ["export", trained, str(out), "--format", "ply"],
@@ -77,9 +75,8 @@ def failures(work: Path) -> dict[str, list]:
 
 
 def main(work: Path) -> list[Row]:
-    """Run that process."""
     data = small_sequence(work / "drive" / "data")
-    demand(run(*arguments(data, work / "drive" / "run", 20)))
+    demand(run(*training(data, work / "drive" / "run", 20)))
     words = [sys.executable, __file__, str(work)]
     told = subprocess.run(words, env=ENVIRONMENT, capture_output=True, encoding="utf-8", check=True).stdout
     return [

@@ -21,8 +21,6 @@ TIMEOUT_S = 600
 
 @dataclass(frozen=True)
 class Row:
-    """One result for the table."""
-
     part: str
     what: str
     figure: str
@@ -55,7 +53,6 @@ class Done:
 
 
 def command(*words: object) -> list[str]:
-    """The program as a command line."""
     return [sys.executable, "-P", "-m", "endoprior", *map(str, words)]
 
 
@@ -84,11 +81,9 @@ class Program:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended; the process stays to be waited for."""
         return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
     def kill(self) -> None:
-        """SIGKILL: what a power cut is to a process."""
         self.process.kill()
 
     def wait(self, timeout: float = TIMEOUT_S) -> Done:
@@ -108,7 +103,6 @@ class Program:
 
 
 def run(*words: object, timeout: float = TIMEOUT_S, limits: Mapping[int, int] | None = None, **variables: str) -> Done:
-    """Run the program to its end."""
     return Program(*words, limits=limits, **variables).wait(timeout)
 
 
@@ -124,13 +118,17 @@ def demand(done: Done) -> Done:
 
 
 def small_sequence(folder: Path, frames: int = 24, width: int = 160, height: int = 128) -> Path:
-    """A phantom to train on within seconds."""
     demand(run("phantom", folder, "--frames", frames, "--width", width, "--height", height))
     return folder
 
 
+def training(data: Path, out: Path, iterations: int) -> list[object]:
+    schedule = ("--schedule.coarse-iterations", 60, "--schedule.fine-iterations", iterations)
+    growth = ("--init-budget", 2000, "--density.start-iteration", 50, "--density.every", 50)
+    return ["train", data, out, "--no-networks", *schedule, *growth]
+
+
 def digest(file: Path) -> str:
-    """SHA-256 of a file; of nothing if there is none."""
     return hashlib.sha256(file.read_bytes() if file.is_file() else b"").hexdigest()
 
 

@@ -15,18 +15,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import disk
 import drives
 import kills
 import limits
-import memory
-import soak
-import stops
+import shortage
 from corpus import CASES
 from harness import ENVIRONMENT, Row
 
 ROOT = Path(__file__).parents[1]
-BAD_INPUTS = str(ROOT / "tests" / "test_bad_inputs.py")
 BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
 
 
@@ -55,15 +51,15 @@ def inputs(work: Path) -> list[Row]:
 
 
 PARTS: dict[str, Callable[[Path], list[Row]]] = {
-    "kills": kills.main,
-    "disk": disk.main,
-    "stops": stops.main,
+    "kills": kills.kills,
+    "disk": shortage.disk,
+    "stops": kills.stops,
     "drives": drives.main,
-    "memory": memory.main,
+    "memory": shortage.memory,
     "inputs": inputs,
     "properties": properties,
-    "soak": soak.main,
-    "limits": limits.main,
+    "soak": limits.soak,
+    "limits": limits.limits,
 }
 
 
@@ -79,7 +75,6 @@ def table(rows: list[Row], minutes: float) -> str:
 
 
 def main() -> int:
-    """Run the parts and print; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--write", type=Path, help="file whose table is replaced")

@@ -24,10 +24,6 @@ from endoprior.render import numba as numba_backend
 
 BENCH = Path(common.__file__).parent
 TINY = Size(40, 48, 40)
-WITHOUT_COMMON = (
-    "plain.py", "gpu_parity.py", "gpu_training.py",  # imported by other scripts only
-    "publish.py", "figures.py", "prepared.py", "golden.py",  # do not import torch
-)  # fmt: skip
 REPEATED = 7
 """An iteration whose frame has a training frame before it."""
 
@@ -115,16 +111,7 @@ def test_idle_threads_are_told_to_sleep_before_torch_is_imported(path):
     if path.name == "common.py":
         assert any("OMP_WAIT_POLICY" in line for line in lines[: imported[1]])
     # The first is imported by stages only, the others do without torch.
-    elif path.stem not in (
-        "plain",
-        "publish",
-        "figures",
-        "method_figures",
-        "prepared",
-        "gpu_parity",
-        "gpu_training",
-        "golden",
-    ):
+    elif path.stem not in ("plain", "publish", "figures", "method_figures", "gpu_parity", "gpu_training", "golden"):
         assert path.stem == "run" or is_common(next(lines[i] for i in imported if is_foreign(lines[i])))
 
 

@@ -15,8 +15,7 @@ from endoprior.tool_masks import network as weights
 from endoprior_studies.tool_training import footage, leave_one_out
 from endoprior_studies.tool_training.benchmark import Counts, SetScore
 from endoprior_studies.tool_training.composites import IGNORED
-from endoprior_studies.tool_training.leave_one_out import Row, Training, network_without, weights_file
-from endoprior_studies.tool_training.report import write_report
+from endoprior_studies.tool_training.leave_one_out import Row, Training, network_without, weights_file, write_report
 
 
 def made_up_set(root):

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from endoprior.core.types import Camera, Frame
-from endoprior_studies.image_grids import (
+from endoprior.model.scene import Scene
+from endoprior_studies.figures import (
     center_density,
     frames_grid,
     instability_map,
@@ -35,6 +36,7 @@ def frame(index: int = 0) -> Frame:
     return Frame(index, index / 4, camera, rgb, mask, depth, np.ones_like(mask))
 
 
+@Scene.register
 @dataclass
 class Still:
     """Stands in for a scene: centers that rest, depth that grows by `step` a frame."""

@@ -19,10 +19,10 @@ from endoprior.evaluation.scoring import evaluate, scored_data
 from endoprior.evaluation.true_masks import SCORES, TrueMasks, score_masks
 from endoprior.model.scene_file import load_scene
 from endoprior.tool_masks import FoundTools
-from endoprior_studies import found_masks
+from endoprior_studies import changed_copy
 from endoprior_studies.changed_copy import write_copy
 from endoprior_studies.matrix import Matrix, run_matrix, scores_of
-from endoprior_studies.preset_method import PresetMethod
+from endoprior_studies.method import PresetMethod
 from endoprior_studies.report import write_report
 from endoprior_studies.results import Results
 from endoprior_studies.spec import Cell, SequenceSpec
@@ -146,7 +146,7 @@ def test_found_masks_are_found_once_and_again_for_other_files(finished, tmp_path
         source = matrix.out.parent / name
         (shutil.copytree if source.is_dir() else shutil.copyfile)(source, tmp_path / name)
     calls = []
-    monkeypatch.setattr(found_masks, "find_in_sequence", lambda sequence: calls.append(1) or iter(masks()))
+    monkeypatch.setattr(changed_copy, "find_in_sequence", lambda sequence: calls.append(1) or iter(masks()))
 
     def masks():
         return [(np.zeros((40, 48), bool), FoundTools(np.zeros((40, 48), bool), 1.0))] * 17
@@ -170,7 +170,7 @@ def test_the_masks_are_hidden_from_the_finder_and_an_interruption_leaves_nothing
         yield np.zeros((40, 48), bool), FoundTools(np.zeros((40, 48), bool), 1.0)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(found_masks, "find_in_sequence", interrupted)
+    monkeypatch.setattr(changed_copy, "find_in_sequence", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_copy(sequence, tmp_path / "found" / "copy", SequenceSpec(masks="found"))
     assert not [*(tmp_path / "found").iterdir()]
@@ -183,7 +183,7 @@ def test_masks_of_either_polarity_are_written_as_the_sequence_has_them(tmp_path,
     (data / "sequence.json").write_text(description.replace('"mask_tool_value": 255', '"mask_tool_value": 0'))
     mask = np.zeros((40, 48), bool)
     mask[:, 30:] = True
-    monkeypatch.setattr(found_masks, "find_in_sequence", lambda sequence: iter([(mask, FoundTools(mask, 1.0))] * 17))
+    monkeypatch.setattr(changed_copy, "find_in_sequence", lambda sequence: iter([(mask, FoundTools(mask, 1.0))] * 17))
     write_copy(load_sequence(data, DataConfig()), tmp_path / "copy", SequenceSpec(masks="found"))
     assert all((found == mask).all() for found in masks_of(tmp_path / "copy"))
 

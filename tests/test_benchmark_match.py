@@ -10,11 +10,12 @@ from benchmark_runs import in_this_process
 
 from endoprior.core.checks import InputError
 from endoprior.runs.log import Growth
-from endoprior_studies.matched_count import MOST_PROBES, Search, matched_table, next_threshold, search_thresholds
+from endoprior_studies.matched_count import MOST_PROBES, Search, next_threshold, search_thresholds
 from endoprior_studies.matrix import run_matrix
 from endoprior_studies.report import write_report
 from endoprior_studies.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec
 from endoprior_studies.spec_file import load_spec
+from endoprior_studies.tables import matched_table
 
 
 def grown(last: float, first: int = 1000) -> Growth:
@@ -69,7 +70,7 @@ def test_a_count_a_growth_and_a_value_are_found():
     assert found["clip", "many", None].best[0] == pytest.approx(2e-4 * 2 ** (-1 / 0.7), rel=0.05)
     assert found["clip", "grown", None].best[0] == pytest.approx(2e-4 * (1.3 / 2) ** (-1 / 0.7), rel=0.05)
     assert found["clip", "same", None] is found["clip", "grown", None]
-    table = matched_table(spec, found)
+    table = matched_table(spec, found).splitlines()
     assert "4,000: as base" in table[2] and "1,300: 1.3 times the start" in table[3]
     assert "| - | threshold of grown |" in table[4]
 
@@ -79,7 +80,7 @@ def test_what_fails_has_a_reason():
     found = search_thresholds(spec, lambda place: math.nan, lambda cells: dict.fromkeys(cells, "it broke"))
     assert found["clip", "many", None].failure == "base has no result to match"
     assert found["clip", "grown", None].failure == "it broke"
-    assert "none: it broke" in matched_table(spec, found)[3]
+    assert "none: it broke" in matched_table(spec, found).splitlines()[3]
 
 
 PRESET = {"preset": "endogaussian"}

@@ -19,9 +19,9 @@ from endoprior.data.writer import SequenceMeta, new_sequence
 from endoprior.evaluation.scorers.camera_path import trajectory_errors
 from endoprior.prepare.camera_path import sequence_path as choose
 from endoprior.tool_masks import FoundTools
-from endoprior_studies import found_masks
+from endoprior_studies import changed_copy
 from endoprior_studies.matrix import run_matrix, scores_of
-from endoprior_studies.preset_method import PresetMethod
+from endoprior_studies.method import PresetMethod
 from endoprior_studies.report import write_report
 from endoprior_studies.spec import Cell
 from endoprior_studies.spec_file import load_spec
@@ -97,7 +97,7 @@ def finished(tmp_path_factory):
     train = PresetMethod.train
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PresetMethod, "train", spy)
-        patch.setattr(found_masks, "find_in_sequence", empty_masks)
+        patch.setattr(changed_copy, "find_in_sequence", empty_masks)
         matrix = run_matrix(load_spec(write_spec(folder)), folder / "out", in_this_process, progress=said.append)
     assert not matrix.missing
     return matrix, trained, said, (before, contents(folder / "clip"))

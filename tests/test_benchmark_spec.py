@@ -13,9 +13,8 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data.scared import dataset_number
 from endoprior.model.presets import preset
-from endoprior_studies.ready_specs import find_spec, spec_names, specs_of
 from endoprior_studies.spec import Cell, MethodSpec, cells, sequence_folder
-from endoprior_studies.spec_file import load_spec, load_specs
+from endoprior_studies.spec_file import find_spec, load_spec, load_specs, spec_names, specs_of
 
 PLAIN = {
     "title": "two methods",
@@ -151,10 +150,7 @@ def test_toml_says_the_same(tmp_path):
             {"sequences": {"a": {"path": "x", "masks": "found"}}, "set": {"data.use_gt_masks": True}},
             "sequences.a.masks: expected either found or gt_masks, got both",
         ),
-        (
-            {"sequences": {"a": {"path": "x", "poses": "own"}}},
-            "a.poses: expected one of 'given', 'estimated'",
-        ),
+        ({"sequences": {"a": {"path": "x", "poses": "own"}}}, "a.poses: expected one of 'given', 'estimated'"),
         (
             {"sequences": {"a": {"path": "x", "poses": "estimated"}}, "set": {"data.depth_unit_mm": 0.5}},
             "sequences.a.poses: expected either estimated or data.depth_unit_mm, got both",
@@ -226,10 +222,7 @@ def test_scared_has_the_settings_published_for_it():
     assert {*methods.sequences} == {"pulling", "cutting"} and spec.methods == methods.methods
     numbers = [dataset_number(spec.resolved(sequence.path)) for sequence in spec.sequences.values()]
     assert numbers == [1, 2, 3, 6, 7], "the stride follows from the folder's name"
-    published = {
-        "deformation.hexplane.channels": 32,
-        "deformation.deform_shape": False,
-    }
+    published = {"deformation.hexplane.channels": 32, "deformation.deform_shape": False}
     shorter = published | {"schedule.fine_iterations": 2000, "optim.decay_iterations": 2000}
     # The release trains as long as on EndoNeRF, does not clean up, and its pixels and principal point agree.
     released = published | {"released.cleanup": False, "released.half_pixel_shift": False}

@@ -18,8 +18,7 @@ from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
-from endoprior_baselines.deform3dgs import METHOD
-from endoprior_baselines.deform3dgs_points import first_points
+from endoprior_baselines.deform3dgs import METHOD, first_points
 from endoprior_baselines.learned_basis import COEFFICIENTS, value_at
 
 

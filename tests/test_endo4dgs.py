@@ -20,8 +20,9 @@ from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
-from endoprior_baselines.endo4dgs import METHOD, SmallField
-from endoprior_baselines.endo4dgs_terms import (
+from endoprior_baselines.endo4dgs import (
+    METHOD,
+    SmallField,
     confident_error,
     gradient_correlation,
     normal_picture,

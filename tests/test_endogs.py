@@ -22,8 +22,7 @@ from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
-from endoprior_baselines.endogs import METHOD, depth_huber
-from endoprior_baselines.endogs_field import JointField
+from endoprior_baselines.endogs import METHOD, JointField, depth_huber
 from endoprior_baselines.plane_terms import PlaneWeights, plane_term
 
 CFG = preset("endogs")

@@ -10,7 +10,7 @@ from endoprior.model.presets import preset
 from endoprior.runs.log import growth_of
 from endoprior.training.density import DensityStats, plan
 from endoprior_studies.matrix import Matrix
-from endoprior_studies.silent_rules import silent_rules
+from endoprior_studies.report import silent_rules
 from endoprior_studies.spec import Cell, MethodSpec, SequenceSpec, Spec
 
 

@@ -15,8 +15,7 @@ from endoprior.data.images import save_png
 from endoprior.data.reading import MOST_PIXELS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
-from corpus_bombs import jpeg_bomb, jpeg_of_two_sizes, mov_bomb, tiff_bomb
-from corpus_damage import png_bomb
+from corpus_damage import jpeg_bomb, jpeg_of_two_sizes, mov_bomb, png_bomb, tiff_bomb
 
 OPENED = """
 import resource, sys

@@ -7,15 +7,13 @@ import math
 import pytest
 import torch
 
-from endoprior_baselines.radiance import endonerf_networks, endosurf_networks
+from endoprior_baselines.radiance import endosurf_networks
 from endoprior_baselines.radiance import presets as presets_radiance
-from endoprior_baselines.radiance.config import RadianceConfig
-from endoprior_baselines.radiance.encoding import encoded, encoded_change, encoded_size
-from endoprior_baselines.radiance.endonerf import EndoNeRF
-from endoprior_baselines.radiance.endonerf_networks import CanonicalNetwork, TimeNetwork
+from endoprior_baselines.radiance.endonerf import CanonicalNetwork, EndoNeRF, TimeNetwork
 from endoprior_baselines.radiance.endosurf import EndoSurf, rounds_of
 from endoprior_baselines.radiance.endosurf_networks import ColorNetwork, DeformationNetwork, SurfaceNetwork
-from endoprior_baselines.radiance.layers import Linear, NormedLinear
+from endoprior_baselines.radiance.layers import Linear, NormedLinear, encoded, encoded_change, encoded_size, start
+from endoprior_baselines.radiance.presets import RadianceConfig
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -78,14 +76,14 @@ def test_length_and_direction_of_rows():
 
 def test_nothing_is_displaced_at_time_0():
     network = TimeNetwork()
-    endonerf_networks.start(network, seeded())
+    start(network, seeded())
     assert torch.equal(network(points(), 0.0), torch.zeros(50, 3))
     assert float(network(points(), 0.5).detach().abs().max()) > 0
 
 
 def test_canonical_values_are_color_and_raw_density():
     network = CanonicalNetwork()
-    endonerf_networks.start(network, seeded())
+    start(network, seeded())
     values = network(points(), torch.nn.functional.normalize(points(), dim=-1))
     assert values.shape == (50, 4)
     assert bool((values[:, :3] > 0).all()) and bool((values[:, :3] < 1).all())

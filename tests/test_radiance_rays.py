@@ -9,12 +9,22 @@ from render_scenes import camera as some_camera
 
 from endoprior.core.geometry import pixel_centers, project
 from endoprior.core.types import Camera
-from endoprior_baselines.radiance import endonerf_losses, endosurf_losses
-from endoprior_baselines.radiance.compositing import Composited, composited, density_alpha, surface_alpha
-from endoprior_baselines.radiance.marching import first_crossing
-from endoprior_baselines.radiance.rays import all_rays, from_perspective, rays_of, to_perspective
-from endoprior_baselines.radiance.refinement import due, refined
-from endoprior_baselines.radiance.sampling import by_weight, centers, even, jittered, sphere_ends, surface_places
+from endoprior_baselines.radiance import endonerf, endosurf
+from endoprior_baselines.radiance.endosurf import first_crossing
+from endoprior_baselines.radiance.rays import all_rays, rays_of, to_perspective
+from endoprior_baselines.radiance.sampling import (
+    Composited,
+    by_weight,
+    centers,
+    composited,
+    density_alpha,
+    even,
+    jittered,
+    sphere_ends,
+    surface_alpha,
+    surface_places,
+)
+from endoprior_baselines.radiance.trainer import due, refined
 
 
 def test_rays_pass_the_pixel_centers():
@@ -45,11 +55,8 @@ def test_perspective_space_is_ndc_of_the_static_camera():
     torch.testing.assert_close(start + t * direction, found, rtol=0, atol=1e-5)
 
 
-def test_perspective_space_and_back():
-    x = torch.tensor([[3.0, -2.0, 50.0], [0.1, 0.2, 5.0]])
-    slopes = torch.tensor([1.7, 2.1])
-    torch.testing.assert_close(from_perspective(to_perspective(x, slopes, 40.0), slopes, 40.0), x)
-    assert bool(to_perspective(torch.zeros(1, 3), slopes, 40.0).isfinite().all())
+def test_perspective_space_is_finite_in_the_plane_of_the_camera():
+    assert bool(to_perspective(torch.zeros(1, 3), torch.tensor([1.7, 2.1]), 40.0).isfinite().all())
 
 
 def test_jitter_stays_between_the_middles():
@@ -152,7 +159,7 @@ def a_view(depth: list[float], alpha: list[float]) -> Composited:
 def test_loss_of_endonerf_by_hand():
     target = torch.tensor([[0.5, 0.5, 0.2], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
     depth, measured = torch.tensor([0.6, 1.0, torch.nan]), torch.tensor([True, True, False])
-    found = endonerf_losses.terms(a_view([0.5, 0.3, 1.0], [1.0, 0.5, 1.0]), target, depth, measured)
+    found = endonerf.loss_terms(a_view([0.5, 0.3, 1.0], [1.0, 0.5, 1.0]), target, depth, measured)
     assert float(found["color"]) == pytest.approx(0.09 / 9)
     near, far = 0.5 * 0.1**2, 0.2 * (0.4 - 0.1)  # Huber's two branches
     assert float(found["depth"]) == pytest.approx((near + far) / 2, rel=1e-4)
@@ -160,25 +167,25 @@ def test_loss_of_endonerf_by_hand():
 
 def test_no_measured_depth_costs_nothing():
     view = a_view([0.5], [0.0])
-    found = endonerf_losses.terms(view, torch.zeros(1, 3), torch.zeros(1), torch.tensor([False]))
+    found = endonerf.loss_terms(view, torch.zeros(1, 3), torch.zeros(1), torch.tensor([False]))
     assert float(found["depth"]) == 0
     none = torch.tensor([False])
-    assert float(endosurf_losses.depth_term(torch.tensor([torch.nan]), torch.zeros(1), none)) == 0
-    assert float(endosurf_losses.neighbor_term(torch.zeros(0, 3), torch.zeros(0, 3))) == 0
+    assert float(endosurf.depth_term(torch.tensor([torch.nan]), torch.zeros(1), none)) == 0
+    assert float(endosurf.neighbor_term(torch.zeros(0, 3), torch.zeros(0, 3))) == 0
 
 
 def test_loss_of_endosurf_by_hand():
     color, target = torch.tensor([[0.1, 0.2, 0.3], [0.0, 0, 0]]), torch.tensor([[0.2, 0.2, 0.1], [0.5, 0, 0]])
-    assert float(endosurf_losses.color_term(color, target)) == pytest.approx((0.3 + 0.5) / 2)
+    assert float(endosurf.EndoSurf.color_term(color, target)) == pytest.approx((0.3 + 0.5) / 2)
     counted = torch.tensor([True, False, True])
-    assert float(endosurf_losses.depth_term(torch.tensor([1.0, 9, 2]), torch.ones(3), counted)) == pytest.approx(0.5)
-    terms = endosurf_losses.surface_terms(torch.tensor([-0.2, 9, 0.4]), torch.tensor([-1.0, 9, 0.5]), counted)
+    assert float(endosurf.depth_term(torch.tensor([1.0, 9, 2]), torch.ones(3), counted)) == pytest.approx(0.5)
+    terms = endosurf.surface_terms(torch.tensor([-0.2, 9, 0.4]), torch.tensor([-1.0, 9, 0.5]), counted)
     assert float(terms["surface"]) == pytest.approx(0.3)
     assert float(terms["angle"]) == pytest.approx(0.1 * 0.25)
     gradients = torch.tensor([[2.0, 0, 0], [0, 1, 0], [0, 0, 5]])
-    assert float(endosurf_losses.eikonal_term(gradients, torch.tensor([0.5, 1.0, 1.3]))) == pytest.approx(0.1 * 0.5)
+    assert float(endosurf.eikonal_term(gradients, torch.tensor([0.5, 1.0, 1.3]))) == pytest.approx(0.1 * 0.5)
     beside = torch.tensor([[0.0, 3, 0], [0, 2, 0]])
-    assert float(endosurf_losses.neighbor_term(gradients[:2], beside)) == pytest.approx(0.1 * 2**0.5 / 2, rel=1e-4)
+    assert float(endosurf.neighbor_term(gradients[:2], beside)) == pytest.approx(0.1 * 2**0.5 / 2, rel=1e-4)
 
 
 def test_refinement_takes_the_worst_tenth():

@@ -28,10 +28,9 @@ from endoprior.training import divergence
 from endoprior.training.divergence import Diverged
 from endoprior.training.trainer import Stage
 from endoprior_baselines.radiance import presets as presets_radiance
-from endoprior_baselines.radiance.enclosing_sphere import enclosing_sphere, without_outliers
 from endoprior_baselines.radiance.endonerf import EndoNeRF, depth_spread
-from endoprior_baselines.radiance.endosurf import EndoSurf
-from endoprior_baselines.radiance.frames import RayFrames, measured
+from endoprior_baselines.radiance.endosurf import EndoSurf, enclosing_sphere, without_outliers
+from endoprior_baselines.radiance.rays import RayFrames, measured
 from endoprior_baselines.radiance.scene import RadianceScene
 from endoprior_baselines.radiance.trainer import RadianceTrainer
 

@@ -21,8 +21,7 @@ from endoprior.training.ops import NUMBA
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 from endoprior_baselines.surface_points import grid_points
-from endoprior_baselines.surgicalgaussian import METHOD, neighbor_terms
-from endoprior_baselines.surgicalgaussian_terms import covariances, distance_change, ssim
+from endoprior_baselines.surgicalgaussian import METHOD, covariances, distance_change, neighbor_terms, ssim
 from endoprior_baselines.time_network import TimeNetwork, encoded, state_shapes
 
 CFG = preset("surgicalgaussian")

@@ -5,18 +5,23 @@ As released. What differs from the release, and why, is in docs/methods.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+import torch
 from torch import Tensor
+from torch.nn.functional import normalize
+from typing_extensions import override
 
 from endoprior.core.config import Config
-from endoprior.core.types import Frame
+from endoprior.core.types import Frame, RenderOutput, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
-from endoprior.model.gaussians import Gaussians
+from endoprior.model.gaussians import SH_C0, Gaussians
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
 from endoprior.model.motion import Motion
 from endoprior.model.presets import paper
+from endoprior.render.projection import rotation_matrices
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
 from endoprior.training.losses import total_variation
@@ -25,14 +30,7 @@ from endoprior.training.optimizer import Rate, rate_of
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
-from .endo4dgs_terms import (
-    confident_error,
-    gradient_correlation,
-    normal_picture,
-    normals_of_depth,
-    without_scale,
-)
-from .plane_terms import PlaneWeights, plane_term
+from .plane_terms import PlaneWeights, planes_of
 from .surface_points import grid_points
 
 EVERY_PX = 2
@@ -41,6 +39,12 @@ DEPTH_WEIGHT, GRADIENT_WEIGHT, NORMAL_WEIGHT, CONFIDENCE_WEIGHT, TV_WEIGHT = 0.0
 PLANES = PlaneWeights(space=1e-4, time=0.01, ones=1e-4)
 GROW_BELOW, REMOVE_ABOVE = 360_000, 200_000
 """Gaussians are added only while there are fewer, and removed only while there are more."""
+
+DEPTH_EPSILON = 1e-6
+VARIANCE_EPSILON = 1e-12
+"""Keeps the gradient of a correlation finite where a depth is flat."""
+LEAST_CONFIDENCE = 1e-6
+"""Confidence is at least this: its logarithm counts."""
 
 
 class SmallField(HexPlaneField):
@@ -79,24 +83,25 @@ class Endo4DGS(GaussianMethod):
             }
         )
 
+    @override
     def motion(self, cfg: Config) -> Motion:
-        """See `Method.motion`."""
         return self._motion
 
+    @override
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
-        """See `GaussianMethod.first_gaussians`."""
         return resting_spheres(grid_points(frames[:1], EVERY_PX, 0), cfg.init.opacity)
 
+    @override
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
-        """See `GaussianMethod.rate`: without a spatial factor."""
+        """Without a spatial factor."""
         return rate_of(name, cfg, 1.0)
 
+    @override
     def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
-        """See `GaussianMethod.position`."""
         return in_epochs(seed, stage, iteration, num_frames)
 
+    @override
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
-        """See `GaussianMethod.terms`."""
         frame, out = drawn.frame, drawn.out
         mask, color = frame.tissue_mask[..., None], out.color * frame.tissue_mask[..., None]
         known, valid = frame.depth, frame.measured & (out.depth > 0)
@@ -114,14 +119,12 @@ class Endo4DGS(GaussianMethod):
         }
         if drawn.stage is Stage.FINE:
             terms["tv"] = TV_WEIGHT * (total_variation(color) + total_variation(out.depth * frame.tissue_mask))
-            anchor = next(iter(drawn.field.parameters.values()))
-            terms["planes"] = plane_term(drawn.field.grid, PLANES, anchor)
-        return terms
+        return terms | planes_of(drawn, PLANES)
 
+    @override
     def plan(
         self, stats: DensityStats, gaussians: Gaussians, extent: float, stage: Stage, iteration: int, cfg: Config
     ) -> Plan:
-        """See `GaussianMethod.plan`."""
         gradient, num = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1), len(gaussians)
         grow = gradient >= cfg.density.grow_threshold
         grow &= num + int(grow.sum()) <= MAX_GAUSSIANS and num < GROW_BELOW
@@ -129,6 +132,58 @@ class Endo4DGS(GaussianMethod):
         remove = (gaussians.opacities < cfg.density.prune_opacity) & (num > REMOVE_ABOVE)
         split = grow & ~small
         return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split, removed_by={"opacity": remove})
+
+
+def without_scale(depth: Tensor, counted: Tensor) -> Tensor:
+    """Depth (H, W) where it counts (bool), else 0, divided by the largest there, which carries a gradient."""
+    depth = depth * counted
+    return depth / (depth.max() + DEPTH_EPSILON)
+
+
+def gradient_correlation(depth: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """1 - Pearson's correlation of the squared gradients (dx^2 + dy^2) of two depths (H, W), ().
+
+    A gradient counts where the pixel, the next one and the one below are `valid` (H, W).
+    """
+    counted = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1]
+    if int(counted.sum()) < 2:
+        return depth.sum() * 0
+    a, b = (_squared_gradient(values)[counted] for values in (depth, target))
+    a, b = a - a.mean(), b - b.mean()
+    return 1 - (a * b).sum() / (a.square().sum() * b.square().sum() + VARIANCE_EPSILON).sqrt()
+
+
+def _squared_gradient(depth: Tensor) -> Tensor:
+    across, down = depth[:-1, 1:] - depth[:-1, :-1], depth[1:, :-1] - depth[:-1, :-1]
+    return across**2 + down**2
+
+
+def normals_of_depth(depth: Tensor) -> Tensor:
+    """(H, W, 3) unit vectors along (dx, -dy, -1) of a depth (H, W); the last row and column repeat those before."""
+    across, down = depth[:-1, 1:] - depth[:-1, :-1], depth[1:, :-1] - depth[:-1, :-1]
+    found = normalize(torch.stack([across, -down, -torch.ones_like(across)], -1), dim=-1)
+    found = torch.cat([found, found[-1:]], 0)
+    return torch.cat([found, found[:, -1:]], 1)
+
+
+def smallest_axes(splats: Splats) -> Tensor:
+    """(N, 3) the axis of each Gaussian along which it is thinnest, in world axes."""
+    axes = rotation_matrices(splats.quats).transpose(1, 2)
+    return axes[torch.arange(len(axes), device=axes.device), splats.scales.argmin(1)]
+
+
+def normal_picture(splats: Splats, draw: Callable[[Splats], RenderOutput]) -> Tensor:
+    """(H, W, 3) the thinnest axes n drawn as colors (n + 1) / 2; color of higher degrees stays in, as released."""
+    first = (((smallest_axes(splats) + 1) / 2 - 0.5) / SH_C0)[:, None]
+    return draw(replace(splats, sh=torch.cat([first, splats.sh[:, 1:]], 1), color_slopes=None)).color
+
+
+def confident_error(value: Tensor, target: Tensor, confidence: Tensor) -> Tensor:
+    """MSE / mean(2 c^2) + mean log c, () of values (P, C) with confidence c (P,); 0 without pixels."""
+    if not len(value):
+        return value.sum()
+    c = confidence.clamp(min=LEAST_CONFIDENCE)
+    return (value - target).square().mean() / (2 * c.square()).mean() + c.log().mean()
 
 
 METHOD = Endo4DGS()

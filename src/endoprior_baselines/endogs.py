@@ -1,19 +1,28 @@
 """EndoGS: a HexPlane field that moves everything, rays weighted by how often tools hide them. As released, 2024.
 
-What differs from the release, and why, is in docs/methods.md. Terms of its loss that carry no gradient there (entropy
-of opacities, signed distance, normals) are left out.
+Field: HexPlane features, trunk (linear F -> W, ReLU, linear W -> W) and one head (ReLU, linear W -> W, ReLU, linear
+W -> 59) for center 3, scale 3, rotation 4, opacity 1, color 48. What differs from the release, and why, is in
+docs/methods.md. Terms of its loss that carry no gradient there (entropy of opacities, signed distance, normals) are
+left out.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, huber_loss
+from torch.nn.functional import adaptive_avg_pool2d, huber_loss, relu
+from typing_extensions import override
 
+from endoprior.compute.relu_network import relu_network
 from endoprior.core.config import Config
+from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Motion
+from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion, LinearLayers, num_features
+from endoprior.model.motion import Field, Motion, Offsets
+from endoprior.model.ops import ModelOps
 from endoprior.model.presets import paper
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.frames import TrainingFrames
@@ -24,9 +33,13 @@ from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
-from .endogs_field import UNIT_MM, JointMotion
-from .plane_terms import PlaneWeights, plane_term
+from .plane_terms import PlaneWeights, planes_of
 
+UNIT_MM = 10.0
+"""Unit of length of what the network gives. COLMAP's, which is any; with this one a scene 10 cm wide has the extent 5
+that the release takes."""
+OUTPUTS = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1, "sh": 48}
+"""What the head gives, in order."""
 SPATIAL_SCALE = 5.0
 """Factor of the rates of centers, network and planes; also the extent, in its unit, that parts clones from splits."""
 EXTENT_MM = SPATIAL_SCALE * UNIT_MM
@@ -44,6 +57,56 @@ MOST_SCALE_SHARE = 0.1
 
 As in `surgicalgaussian`, the radius of 20 px that the release also names is left out.
 """
+
+
+class JointField(HexPlaneField):
+    """See the head of this file."""
+
+    width = 256
+
+    @override
+    @classmethod
+    def layer_shapes(cls, cfg: DeformationConfig) -> dict[str, tuple[int, int]]:
+        width = cls.width
+        layers = {"trunk": (width, num_features(cfg))} | {name: (width, width) for name in ("second", "hidden")}
+        return layers | {"output": (sum(OUTPUTS.values()), width)}
+
+    @override
+    @classmethod
+    def make_heads(cls, cfg: DeformationConfig, generator: torch.Generator, zero_biases: bool) -> LinearLayers:
+        return LinearLayers(cls.layer_shapes(cfg), generator, zero_biases)
+
+    @override
+    def offsets(self, means: Tensor, time: float, ops: ModelOps) -> Offsets:
+        (trunk,) = self.trunk(means, (time,), ops)
+        layers = [self.heads.layer(name) for name in ("second", "hidden", "output")]
+        values = relu_network(relu(trunk), layers)
+        parts = dict(zip(OUTPUTS, values.split(list(OUTPUTS.values()), 1), strict=True))
+        parts["means"] = UNIT_MM * parts["means"]
+        sh = parts.pop("sh").reshape(len(means), 16, 3)
+        opacity = parts.pop("opacity_logits")[:, 0]
+        return Offsets(**parts, opacity_logits=opacity, sh_dc=sh[:, 0], sh_rest=sh[:, 1:])
+
+
+class JointMotion(HexPlaneMotion):
+    """See `JointField`."""
+
+    field_class = JointField
+
+    @override
+    def offsets(
+        self,
+        gaussians: Gaussians,
+        field: Field | None,
+        time: float,
+        cfg: Config,
+        ops: ModelOps,
+        chosen: Tensor | None = None,
+    ) -> Offsets:
+        """Colors beyond the degree of the Gaussians are left out."""
+        found = super().offsets(gaussians, field, time, cfg, ops, chosen)
+        assert found.sh_rest is not None
+        return replace(found, sh_rest=found.sh_rest[:, : gaussians["sh_rest"].shape[1]])
 
 
 class EndoGS(GaussianMethod):
@@ -71,12 +134,12 @@ class EndoGS(GaussianMethod):
             }
         )
 
+    @override
     def motion(self, cfg: Config) -> Motion:
-        """See `Method.motion`."""
         return self._motion
 
+    @override
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
-        """See `GaussianMethod.rate`."""
         if name != "box" and name != PLANES and not name.startswith("network"):
             return rate_of(name, cfg, EXTENT_MM)
         scale, start = EXTENT_MM if name == "box" else SPATIAL_SCALE, PLANES_RATE
@@ -84,36 +147,38 @@ class EndoGS(GaussianMethod):
             start = NETWORK_RATE
         return lambda iteration: scale * log_linear(start, start, iteration, cfg.optim.decay_iterations)
 
+    @override
     def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
-        """See `GaussianMethod.position`."""
         return in_epochs(seed, stage, iteration, num_frames)
 
+    @override
     def context(self, frames: TrainingFrames, cfg: Config) -> Tensor:
         """(H, W) 1 + 30 F / ||F||, F the number of frames in which a tool hides the pixel."""
-        hidden = sum((~frames.frame(i).tissue_mask).float() for i in range(len(frames)))
+        hidden = (~frames.frame(0).tissue_mask).float()
+        for i in range(1, len(frames)):
+            hidden += ~frames.frame(i).tissue_mask
         norm = hidden.norm()
         return 1 + OFTEN_HIDDEN * (hidden / norm if norm else hidden)
 
+    @override
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
-        """See `GaussianMethod.terms`."""
         frame, out = drawn.frame, drawn.out
         mask, weight = frame.tissue_mask[..., None], drawn.context
         if weight.shape != frame.tissue_mask.shape:  # at half resolution
-            weight = adaptive_avg_pool2d(weight[None], frame.tissue_mask.shape)[0]
+            height, width = frame.tissue_mask.shape
+            weight = adaptive_avg_pool2d(weight[None], (height, width))[0]
         terms = {
             "color": ((out.color - frame.rgb).abs() * mask * weight[..., None]).mean(),
             "depth": DEPTH_WEIGHT * depth_huber(out.depth, frame.depth, frame.measured),
             "tv": TV_WEIGHT * total_variation(out.color * ~mask),
         }
-        if drawn.stage is Stage.FINE:
-            anchor = next(iter(drawn.field.parameters.values()))
-            terms["planes"] = plane_term(drawn.field.grid, PLANE_WEIGHTS, anchor)
-        return terms
+        return terms | planes_of(drawn, PLANE_WEIGHTS)
 
+    @override
     def plan(
         self, stats: DensityStats, gaussians: Gaussians, extent: float, stage: Stage, iteration: int, cfg: Config
     ) -> Plan:
-        """See `GaussianMethod.plan`: grow every time, prune seldom."""
+        """Grow every time, prune seldom."""
         gradient, largest = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1), gaussians.scales.amax(-1)
         grow = gradient >= cfg.density.grow_threshold
         small = largest <= CLONE_EXTENT * EXTENT_MM
@@ -126,8 +191,9 @@ class EndoGS(GaussianMethod):
         rules = {"opacity": faint, "size": large}
         return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split, removed_by=rules)
 
+    @override
     def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
-        """See `GaussianMethod.reset_due`; the first one belongs to the white background."""
+        """The first one belongs to the white background."""
         inside = iteration < cfg.density.stop_iteration
         return inside and (iteration == FIRST_RESET or iteration % RESET_EVERY == 0)
 

@@ -1,10 +1,11 @@
-"""Points on a grid of pixels, where frames show tissue with depth."""
+"""Points on the surface that frames show, which methods start from."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from endoprior.core.checks import input_error
 from endoprior.core.geometry import back_project
@@ -24,13 +25,23 @@ def grid_points(frames: Sequence[Frame], every_px: int, first_px: int) -> PointC
     grid[first_px::every_px, first_px::every_px] = True
     clouds = []
     for position, frame in enumerate(frames):
-        v, u = np.nonzero(grid & frame.tissue_mask & has_surface(frame))
-        grid[v, u] = False
-        points = back_project(np.stack([u, v], -1) + 0.5, frame.depth[v, u].astype(np.float64), frame.camera)
-        colors = frame.rgb_u8[v, u].astype(np.float32) / np.float32(255)
-        clouds.append(PointCloud(points.astype(np.float32), colors, np.full(len(v), position, np.int32)))
-    cloud = concatenated(clouds)
+        pixels = grid & frame.tissue_mask & has_surface(frame)
+        grid &= ~pixels
+        clouds.append(surface_points(frame, position, pixels))
+    return enough(concatenated(clouds), " on tissue with depth")
+
+
+def surface_points(frame: Frame, position: int, pixels: NDArray[np.bool_]) -> PointCloud:
+    """World points and colors of some pixels (H, W) of the frame at `position`, row by row."""
+    v, u = np.nonzero(pixels)
+    points = back_project(np.stack([u, v], -1) + 0.5, frame.depth[v, u].astype(np.float64), frame.camera)
+    colors = frame.rgb_u8[v, u].astype(np.float32) / np.float32(255)
+    return PointCloud(points.astype(np.float32), colors, np.full(len(v), position, np.int32))
+
+
+def enough(cloud: PointCloud, what: str) -> PointCloud:
+    """The cloud; InputError if it has fewer than 4 points."""
     if len(cloud) < MIN_POINTS:
-        want = f"at least {MIN_POINTS} points on tissue with depth"
-        raise input_error("initialization", want, str(len(cloud)), "Check masks and depth: `endoprior check DATA`.")
+        fix = "Check masks and depth: `endoprior check DATA`."
+        raise input_error("initialization", f"at least {MIN_POINTS} points{what}", str(len(cloud)), fix)
     return cloud

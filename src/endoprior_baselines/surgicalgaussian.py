@@ -7,20 +7,25 @@ differs from the release, and why, is in docs/methods.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import conv2d, normalize
+from typing_extensions import override
 
 from endoprior.compute.neighbors import nearest
 from endoprior.core.config import Config
 from endoprior.core.types import Frame, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Motion, Offsets
+from endoprior.model.motion import Field, Motion, Offsets
 from endoprior.model.ops import ModelOps
 from endoprior.model.presets import paper
+from endoprior.render.projection import rotation_matrices
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
@@ -31,7 +36,6 @@ from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
 from .surface_points import grid_points
-from .surgicalgaussian_terms import covariances, distance_change, ssim
 from .time_network import TimeNetwork, state_shapes
 
 UNIT_MM = 100.0
@@ -52,36 +56,45 @@ SMALLEST_SCALE_MM = 1e-6
 NETWORK_LATER = 4 / 3
 """The network's rate decays over this many times the iterations of the centers'."""
 
+WINDOW, SIGMA = 11, 1.5
+LINE = cv2.getGaussianKernel(WINDOW, SIGMA)
+"""(11, 1) the window along one axis."""
+C1, C2 = 0.01**2, 0.03**2
+TINY = 1e-20
+"""Keeps the gradient of a length finite at 0."""
+
 
 class NetworkMotion(Motion):
     """See `TimeNetwork`. Offsets of scales and rotations are added after activation, as released."""
 
+    @override
     def field(self, points: Tensor, cfg: Config) -> TimeNetwork:
-        """See `Motion.field`."""
         return TimeNetwork.fresh(torch.Generator().manual_seed(cfg.seed))
 
+    @override
     def field_of(self, arrays: Mapping[str, Tensor], cfg: Config) -> TimeNetwork:
-        """See `Motion.field_of`."""
         return TimeNetwork.of_arrays(arrays)
 
+    @override
     def field_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
-        """See `Motion.field_shapes`."""
         return state_shapes()
 
+    @override
     def parameter_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
-        """See `Motion.parameter_shapes`."""
         return {f"network.{name}": shape for name, shape in state_shapes().items()}
 
+    @override
     def offsets(
         self,
         gaussians: Gaussians,
-        field: TimeNetwork,
+        field: Field | None,
         time: float,
         cfg: Config,
         ops: ModelOps,
         chosen: Tensor | None = None,
     ) -> Offsets:
-        """See `Motion.offsets`. A scale that becomes negative counts as its absolute value: the covariance is equal."""
+        """A scale that becomes negative counts as its absolute value: the covariance is equal."""
+        assert isinstance(field, TimeNetwork)
         rows = slice(None) if chosen is None else chosen
         means, quats, log_scales = (gaussians[name][rows] for name in ("means", "quats", "log_scales"))
         found = field(means.detach() / UNIT_MM, time)
@@ -118,27 +131,28 @@ class SurgicalGaussian(GaussianMethod):
             }
         )
 
+    @override
     def motion(self, cfg: Config) -> Motion:
-        """See `Method.motion`."""
         return self._motion
 
+    @override
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
-        """See `GaussianMethod.first_gaussians`."""
         return resting_spheres(grid_points(frames, EVERY_PX, FIRST_PX), cfg.init.opacity)
 
+    @override
     def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
-        """See `GaussianMethod.position`."""
         return in_epochs(seed, stage, iteration, num_frames)
 
+    @override
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
-        """See `GaussianMethod.rate`; the network has no length."""
+        """The network has no length."""
         if not name.startswith("network"):
             return rate_of(name, cfg, UNIT_MM)
         steps = round(NETWORK_LATER * cfg.optim.decay_iterations)
         return lambda iteration: log_linear(NETWORK_LR, FINAL_SHARE * NETWORK_LR, iteration, steps)
 
+    @override
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
-        """See `GaussianMethod.terms`."""
         frame, out, gaussians = drawn.frame, drawn.out, drawn.gaussians
         mask = frame.tissue_mask[..., None]
         color, target = out.color * mask, frame.rgb * mask
@@ -150,10 +164,11 @@ class SurgicalGaussian(GaussianMethod):
         }
         return terms if drawn.offsets is None else terms | neighbor_terms(gaussians, drawn.offsets, drawn.splats)
 
+    @override
     def plan(
         self, stats: DensityStats, gaussians: Gaussians, extent: float, stage: Stage, iteration: int, cfg: Config
     ) -> Plan:
-        """See `GaussianMethod.plan`: also what is large goes, once opacities were reset."""
+        """Also what is large goes, once opacities were reset."""
         planned = density.plan(stats, gaussians.scales, gaussians.opacities, UNIT_MM, cfg.density)
         if iteration <= RESET_EVERY:
             return planned
@@ -162,8 +177,9 @@ class SurgicalGaussian(GaussianMethod):
         rules = {**planned.removed_by, "size": large}
         return Plan(clone=planned.clone & ~large, split=planned.split, remove=planned.remove | large, removed_by=rules)
 
+    @override
     def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
-        """See `GaussianMethod.reset_due`; the first one belongs to the white background."""
+        """The first one belongs to the white background."""
         inside = iteration < cfg.density.stop_iteration
         return inside and (iteration == FIRST_RESET or iteration % RESET_EVERY == 0)
 
@@ -176,12 +192,62 @@ def neighbor_terms(gaussians: Gaussians, offsets: Offsets, splats: Splats) -> di
     means, quats = gaussians["means"], gaussians["quats"]
     found, _ = nearest(means.detach().cpu().numpy(), min(NUM_NEIGHBORS, len(means) - 1))
     neighbors = torch.from_numpy(found).to(means.device)
+    assert offsets.quats is not None
     moved = quats + (offsets.quats + quats - normalize(quats, dim=-1))
     before, after = covariances(quats, gaussians.scales / UNIT_MM), covariances(moved, splats.scales / UNIT_MM)
     return {
         "distance": DISTANCE_WEIGHT * distance_change(means / UNIT_MM, splats.means / UNIT_MM, neighbors),
         "shape": SHAPE_WEIGHT * distance_change(before, after, neighbors),
     }
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity of two images (H, W, 3), (): Gaussian window of 11 px, zeros outside the frame."""
+    smooth = _Smoothed.apply if image.device.type == "cpu" else smoothed
+    mean_a, mean_b = smooth(image), smooth(target)
+    variance_a, variance_b = smooth(image * image) - mean_a**2, smooth(target * target) - mean_b**2
+    covariance = smooth(image * target) - mean_a * mean_b
+    luminance = (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
+    return (luminance * (2 * covariance + C2) / (variance_a + variance_b + C2)).mean()
+
+
+def smoothed(values: Tensor) -> Tensor:
+    """(H, W, 3) values weighted by the window around each pixel; zeros outside."""
+    line = torch.as_tensor(LINE, dtype=values.dtype, device=values.device)
+    rows = conv2d(values.permute(2, 0, 1)[:, None], line.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))
+    return conv2d(rows, line.view(1, 1, 1, -1), padding=(0, WINDOW // 2))[:, 0].permute(1, 2, 0)
+
+
+class _Smoothed(torch.autograd.Function):
+    """`smoothed` by OpenCV, many times faster on a CPU. The window is symmetric, so it is its own gradient."""
+
+    @staticmethod
+    def forward(_ctx: Any, values: Tensor) -> Tensor:
+        return _by_opencv(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(_ctx: Any, v_out: Tensor) -> Tensor:
+        return _by_opencv(v_out)
+
+
+def _by_opencv(values: Tensor) -> Tensor:
+    array = values.detach().contiguous().numpy()
+    return torch.from_numpy(cv2.sepFilter2D(array, -1, LINE, LINE, borderType=cv2.BORDER_CONSTANT))
+
+
+def distance_change(before: Tensor, after: Tensor, neighbors: Tensor) -> Tensor:
+    """Mean absolute change of the distance between each of N vectors (N, D) and its neighbors (N, K), ()."""
+    lengths = [((values[:, None] - values[neighbors]) ** 2).sum(-1).add(TINY).sqrt() for values in (before, after)]
+    return (lengths[0] - lengths[1]).abs().mean()
+
+
+def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """(N, 6) upper triangle of R S S R^T, from quaternions (N, 4) of any length but zero and scales (N, 3)."""
+    axes = rotation_matrices(quats) * scales[:, None, :]
+    full = axes @ axes.transpose(1, 2)
+    i, j = torch.triu_indices(3, 3, device=full.device)
+    return full[:, i, j]
 
 
 METHOD = SurgicalGaussian()

@@ -1,6 +1,6 @@
 """A network of place and time: frequency encodings, eight layers of 256, and a head for center, rotation and scale.
 
-enc(x, L) = x, sin(2^k x), cos(2^k x) for k < L. The encoding enters again after the fifth layer. As in SurgicalGaussian
+The encoding enters again after the fifth layer. As in SurgicalGaussian
 (Xie et al., MICCAI 2024) and in Yang et al., "Deformable 3D Gaussians", CVPR 2024.
 """
 
@@ -11,21 +11,18 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from endoprior.compute.relu_network import relu_network
 from endoprior.core.checks import InputError
 from endoprior.model.motion import Field
 
+from .radiance.layers import encoded, encoded_size
+
 PLACE_BANDS, TIME_BANDS = 10, 4
 WIDTH, DEPTH, SKIP_AFTER = 256, 8, 4
 HEADS = {"means": 3, "quats": 4, "scales": 3}
-INPUTS = 3 * (1 + 2 * PLACE_BANDS) + 1 + 2 * TIME_BANDS
-
-
-def encoded(values: Tensor, bands: int) -> Tensor:
-    """(N, D (1 + 2 bands)) the values (N, D), then sine and cosine of each times 1, 2, 4, ..."""
-    waves = [wave(2.0**k * values) for k in range(bands) for wave in (torch.sin, torch.cos)]
-    return torch.cat([values, *waves], -1)
+INPUTS = encoded_size(3, PLACE_BANDS) + encoded_size(1, TIME_BANDS)
 
 
 def layer_shapes() -> dict[str, tuple[int, int]]:
@@ -83,16 +80,16 @@ class TimeNetwork(Field):
         return self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
 
     @property
+    @override
     def parameters(self) -> dict[str, Tensor]:
-        """See `Field.parameters`."""
         return {f"network.{name}": value for name, value in self._weights.items()}
 
+    @override
     def state_arrays(self) -> dict[str, Tensor]:
-        """See `Field.state_arrays`."""
         return {name: value.detach() for name, value in self._weights.items()}
 
+    @override
     def to(self, device: torch.device | str, *, fp16_planes: bool = False) -> TimeNetwork:
-        """See `Field.to`."""
         device = torch.device(device)
         if next(iter(self._weights.values())).device.type == device.type:
             return self

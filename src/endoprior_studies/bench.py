@@ -11,7 +11,6 @@ from endoprior.cli.arguments import Command, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
 
-from .ready_specs import find_spec, specs_of
 from .tool_training import bench as bench_masks
 
 MOST_CORES = 4096
@@ -58,13 +57,11 @@ def run(argv: list[str]) -> int:
     from .execute import local_executor, ray_executor
     from .matrix import run_matrix
     from .report import write_overview, write_report
-    from .spec_file import load_specs
+    from .spec_file import find_spec, load_specs, specs_of
 
     for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
         if not least <= value <= MOST_CORES:
-            raise input_error(
-                option, f"{least} to {MOST_CORES}", f"{value}", f"Choose a value from {least} to {MOST_CORES}."
-            )
+            raise input_error(option, f"{least} to {MOST_CORES}", f"{value}", "choose a value in this range.")
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     folders, source = _folders(args.data), find_spec(args.spec)

@@ -7,16 +7,23 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
+from endoprior.core.checks import InputError, input_error
 from endoprior.core.config import DataConfig
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.evaluation.true_masks import SCORES_FILE
-from endoprior.system.atomic import whole_folder
+from endoprior.data.description import read_description
+from endoprior.data.folder_edits import BACKUP, POSES, note_found_masks, write_mask
+from endoprior.evaluation.true_masks import SCORES_FILE, TrueMasks, score_masks
+from endoprior.prepare.folder_path import write_folder_path
+from endoprior.system.atomic import whole_folder, write_json
+from endoprior.tool_masks.sequence import find_in_sequence
 
-from .estimated_poses import demand_given_path, put_estimated_path
-from .found_masks import demand_masks, put_found_masks, write_scores
 from .spec import SequenceSpec
 
 KEY_DIGITS = 8
+LENS = "as the sequence has it"
+"""Source of the focal length in the copy: scores use the lens of the sequence, so that it is not refined."""
 
 
 def changed_copy(
@@ -34,22 +41,37 @@ def changed_copy(
         InputError: the sequence has no masks to hide or no path to compare with, or cannot be read; or `write` is
             False and there is no copy.
     """
-    whole = load_sequence(folder, DataConfig(format=chosen.format, stride=1))
-    if chosen.masks == "found":
-        demand_masks(whole)
+    reading = DataConfig(format=chosen.format, stride=1)
+    whole = load_sequence(folder, reading)
+    if chosen.masks == "found" and not whole.mask_files:
+        want, fix = "a PNG mask per frame, to hide and to score against", "add true masks, or remove `masks: found`."
+        raise input_error(whole.path, want, "none", fix)
     if chosen.poses == "estimated":
-        demand_given_path(whole)
+        _demand_given_path(whole)
     key = hashlib.sha256(f"{whole.fingerprint()} {version}".encode()).hexdigest()[:KEY_DIGITS]
     copy = sequences / "-".join([folder.resolve().name, *chosen.found_parts.values(), key])
     if write and not copy.is_dir():
         write_copy(whole, copy, chosen, say)
     if write and chosen.masks == "found" and not (copy / SCORES_FILE).exists():
-        write_scores(whole, load_sequence(copy, DataConfig(format=chosen.format, stride=1)))
+        found = load_sequence(copy, reading)
+        score_masks(found, TrueMasks(whole.path, found)).save(found.path)
     return load_sequence(copy, DataConfig(**chosen.reading))
 
 
+def _demand_given_path(sequence: FrameSequence) -> None:
+    """Raise InputError if a sequence has no poses to compare with, or is in no folder that can take others."""
+    folder, fix = sequence.path, "remove `poses: estimated`."
+    if not (folder / POSES).exists() or not all((folder / part).is_dir() for part in ("images", "masks", "depth")):
+        raise input_error(folder, f"a folder with images/, masks/, depth/ and {POSES}", "another layout", fix)
+    if sequence.poses_are_estimated:
+        raise input_error(folder, "given poses, to compare with", f"those by {sequence.sources['poses']}", fix)
+    first = sequence.camera(0).world_to_camera
+    if all(np.array_equal(sequence.camera(i).world_to_camera, first) for i in range(len(sequence))):
+        raise InputError(f"{folder}: the camera does not move. Fix: Remove `poses: estimated`.")
+
+
 def write_copy(
-    sequence: FrameSequence, copy: Path, chosen: SequenceSpec, say: Callable[[str], None] = lambda text: None
+    sequence: FrameSequence, copy: Path, chosen: SequenceSpec, say: Callable[[str], None] = lambda _text: None
 ) -> None:
     """Copy the files of a sequence, and find the masks first: the path is estimated with them, as for a user's video.
 
@@ -68,7 +90,30 @@ def write_copy(
             shutil.copyfile(file, place)
         if chosen.masks == "found":
             say(f"finding tools in {len(sequence)} frames")
-            put_found_masks(sequence, temporary)
+            _put_found_masks(sequence, temporary)
         if chosen.poses == "estimated":
             say(f"following the camera through {len(sequence)} frames")
-            put_estimated_path(sequence, temporary)
+            _put_estimated_path(sequence, temporary)
+
+
+def _put_found_masks(sequence: FrameSequence, copy: Path) -> None:
+    """Find the tools of a sequence without its masks, and write the masks into a copy of its folder that has none."""
+    found, with_tools = find_in_sequence(sequence.without_masks()), 0
+    for file, (mask, tools) in zip(sequence.mask_files, found, strict=True):
+        place = copy / file.relative_to(sequence.path).as_posix()
+        place.parent.mkdir(exist_ok=True)
+        write_mask(place, mask, sequence.mask_tool_value)
+        with_tools += bool(tools.mask.any())
+    note_found_masks(copy, with_tools / len(sequence))
+
+
+def _put_estimated_path(sequence: FrameSequence, copy: Path) -> None:
+    """Replace the poses in a copy of the folder of a sequence, as `endoprior poses` does; the old ones are removed."""
+    described, camera = read_description(copy / "sequence.json"), sequence.camera(0)
+    sources = sequence.sources | described.get("sources", {}) | {"lens": LENS}
+    # Some layouts have these facts in files of their own.
+    facts = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    facts |= {"depth_relative": sequence.depth_is_relative, "sources": sources}
+    write_json(copy / "sequence.json", described | facts)
+    write_folder_path(copy)
+    (copy / BACKUP).unlink(missing_ok=True)

@@ -6,12 +6,11 @@ import os
 import signal
 import subprocess
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from endoprior.system.console import say
 from endoprior.system.ray_cluster import connected
@@ -32,12 +31,8 @@ class Outcome:
     """Why it failed, from the end of its log; empty if it succeeded."""
 
 
-class Executor(Protocol):
-    """Where jobs run."""
-
-    def __call__(self, jobs: list[Job]) -> Iterator[Outcome]:
-        """Yield the outcome of each job as it ends."""
-        ...
+Executor = Callable[[list[Job]], Iterator[Outcome]]
+"""Where jobs run; yields the outcome of each as it ends."""
 
 
 def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
@@ -83,8 +78,7 @@ def local_executor(num_jobs: int) -> Iterator[Executor]:
                     while waiting and len(running) < num_jobs:
                         running.add(pool.submit(run_job, waiting.pop(), started))
                     done, running = wait(running, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        yield future.result()
+                    yield from (future.result() for future in done)
             except BaseException:
                 for process in started:
                     # Windows cannot send it, but its console sends Ctrl-C to all processes.

@@ -76,9 +76,7 @@ def next_threshold(search: Search) -> float | None:
 
 
 def search_thresholds(
-    spec: Spec,
-    counts: Callable[[Place], float],
-    train: Callable[[dict[Cell, float]], dict[Cell, Growth | str]],
+    spec: Spec, counts: Callable[[Place], float], train: Callable[[dict[Cell, float]], dict[Cell, Growth | str]]
 ) -> dict[Place, Search]:
     """Search for every method with a `MatchSpec`, in rounds: those of one round train side by side.
 
@@ -89,10 +87,10 @@ def search_thresholds(
         A search per place; those with `value_of` share that of another method.
     """
     found: dict[Place, Search] = {}
-    probes = {place: Cell(*place, spec.seeds[0], spec.sequences[place[0]].folds[0]) for place in _places(spec)}
-    for place in probes:
+    matches = matches_of(spec)
+    probes = {place: Cell(*place, spec.seeds[0], spec.sequences[place[0]].folds[0]) for place in matches}
+    for place, match in matches.items():
         sequence, method, budget = place
-        match = spec.methods[method].match
         if match.value_of:
             continue
         start = spec.config(method, sequence, budget, spec.seeds[0]).density.grow_threshold
@@ -108,11 +106,11 @@ def search_thresholds(
                 search.failure = result
                 continue
             search.tried.append((value, result))
-            if growth := spec.methods[place[1]].match.growth:
+            if growth := matches[place].growth:
                 search.target = growth * result.first
-    for place in probes:
-        if other := spec.methods[place[1]].match.value_of:
-            found[place] = found[place[0], other, place[2]]
+    for place, match in matches.items():
+        if match.value_of:
+            found[place] = found[place[0], match.value_of, place[2]]
     return found
 
 
@@ -120,29 +118,8 @@ def _next(search: Search) -> float | None:
     return None if search.failure else next_threshold(search)
 
 
-def _places(spec: Spec) -> list[Place]:
+def matches_of(spec: Spec) -> dict[Place, MatchSpec]:
+    """How each threshold is searched."""
     budgets: Sequence[int | None] = spec.budgets or (None,)
-    return [(s, m, b) for s in spec.sequences for m, about in spec.methods.items() if about.match for b in budgets]
-
-
-def matched_table(spec: Spec, searches: dict[Place, Search]) -> list[str]:
-    """Lines of a Markdown table: what was wanted, and what was found."""
-    titles = ("method", "sequence", "threshold of growth", "Gaussians", "wanted", "trainings")
-    lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
-    for (sequence, method, budget), search in searches.items():
-        name = spec.label(method) + (f", {budget:,}" if budget else "")
-        value, counted, wanted = _words(spec.methods[method].match, search)
-        lines.append(f"| {name} | {sequence} | {value} | {counted} | {wanted} | {len(search.tried)} |")
-    return lines
-
-
-def _words(match: MatchSpec, search: Search) -> tuple[str, str, str]:
-    """The threshold, what it gave and what was wanted, in words."""
-    if search.failure:
-        return f"none: {search.failure}", "-", "-"
-    value = f"{search.best[0]:.3g}"
-    if match.value_of:
-        return value, "-", f"threshold of {match.value_of}"
-    why = f"as {match.count_of}" if match.count_of else f"{match.growth:g} times the start"
-    missed = "" if search.matched else " (not reached)"
-    return value, f"{search.best[1].last:,}{missed}", f"{search.target:,.0f}: {why}"
+    methods = {method: about.match for method, about in spec.methods.items() if about.match}
+    return {(s, m, b): match for s in spec.sequences for m, match in methods.items() for b in budgets}

@@ -14,6 +14,7 @@ import re
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,7 +72,7 @@ def run_matrix(
     *,
     threads: int = 1,
     weights_dir: Path | None = None,
-    progress: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str], None] = lambda _text: None,
 ) -> Matrix:
     """Run every cell that is not finished yet; methods with a search for their threshold come after the others.
 
@@ -128,7 +129,11 @@ class _Runner:
                 sequence = _sequence(spec, name, matrix.out, write)
                 self.trained_on[name], self.known[name] = sequence.path, [sequence.fingerprint()]
                 if found := spec.sequences[name].found_parts:
-                    copy = _changed_copy(spec, name, sequence.path, matrix.out, progress, write)
+                    from .changed_copy import changed_copy  # late: it imports what finds tools and follows the camera
+
+                    say = partial(self._say_of, name)
+                    folder, chosen = matrix.out / "sequences", spec.sequences[name]
+                    copy = changed_copy(sequence.path, chosen, folder, SCORES_VERSION, say, write=write)
                     self.trained_on[name] = copy.path
                     self.known[name] += [copy.fingerprint()]
                     self.known[name] += [read_json(copy.path / SCORES_FILE)["scores"]] if "masks" in found else []
@@ -136,6 +141,9 @@ class _Runner:
                 matrix.relative |= {name} if sequence.depth_is_relative else set()
             except InputError as error:
                 self.unreadable[name] = str(error)
+
+    def _say_of(self, name: str, text: str) -> None:
+        self.progress(f"{name}: {text}")
 
     def report(self, some: list[Cell]) -> None:
         """Say how many of some cells there are to run."""
@@ -163,7 +171,7 @@ class _Runner:
                 jobs[job.folder] = job
                 by_folder.setdefault(job.folder, []).append(cell)
         began, ended = clock.perf_counter(), 0
-        for outcome in self.execute([*jobs.values()]) if jobs else ():
+        for outcome in self.execute([*jobs.values()]) if self.execute and jobs else ():
             ended += 1
             for cell in by_folder[outcome.job.folder]:
                 if outcome.failure:
@@ -254,18 +262,6 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequence:
     if chosen.phantom and write and not folder.is_dir():
         write_phantom(folder, chosen.phantom)
     return load_sequence(folder, DataConfig(**chosen.reading))
-
-
-def _changed_copy(
-    spec: Spec, name: str, folder: Path, out: Path, progress: Callable[[str], None], write: bool
-) -> FrameSequence:
-    """See `changed_copy`, which is imported late: it needs what finds tools and follows the camera."""
-    from .changed_copy import changed_copy
-
-    def say(text: str) -> None:
-        progress(f"{name}: {text}")
-
-    return changed_copy(folder, spec.sequences[name], out / "sequences", SCORES_VERSION, say, write=write)
 
 
 def commits_of(matrix: Matrix) -> list[str]:

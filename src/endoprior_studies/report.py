@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from endoprior.core.config_io import to_dict
 from endoprior.evaluation.registry import all_scores
+from endoprior.runs.log import growth_of
 from endoprior.system.atomic import write_json, write_text
 
-from .image_grids import GRIDS, write_image_grids
-from .matched_count import matched_table
+from .figures import GRIDS, budget_figure, curve_figure, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
-from .plots import budget_figure, curve_figure
-from .protocol_report import protocol_blocks, protocol_tables, protocol_values
 from .results import Results
-from .silent_rules import silent_rules
-from .spec import ClaimSpec, Spec
+from .spec import ClaimSpec
 from .statistics import Difference
-from .tables import csv_lines, latex, markdown, score_table
+from .tables import (
+    csv_lines,
+    grid,
+    latex,
+    markdown,
+    matched_table,
+    protocol_blocks,
+    protocol_tables,
+    protocol_values,
+    score_table,
+)
 
 SHOWN_NAMES = 6
 
@@ -111,38 +120,53 @@ def _protocol(matrices: list[Matrix], level: int) -> list[str]:
 
 
 def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
-    spec, blocks = matrix.spec, []
-    for name in spec.sequences:
+    blocks = []
+    for name in matrix.spec.sequences:
         if name not in matrix.data:
             continue
         blocks += [f"{mark} {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
-        scores, others = _of_scenes(spec), [method for method in spec.methods if method != spec.reference]
-        changes = {m: {s: results.difference(s, m, spec.reference, name) for s in scores} for m in others}
-        blocks += _differences(results, name, spec.label(spec.reference), changes)
-        if own := spec.with_own_parts(name):
-            changes = {m: {s: results.gain_of_found(s, m, name, own) for s in scores} for m in spec.methods}
-            parts = " and ".join(spec.sequences[name].found_parts)
-            blocks += _differences(results, name, f"{own}, which has its own {parts}", changes)
+        for compared in _comparisons(results, name):
+            blocks += _differences(results, name, compared)
     return blocks
 
 
-def _of_scenes(spec: Spec) -> list[str]:
-    """The scores without those of masks, which are equal for all methods."""
-    return [score for score in spec.scores if all_scores()[score].group != "masks"]
+@dataclass(frozen=True)
+class Compared:
+    """Paired differences on one sequence, by method and score."""
+
+    kind: Literal["differences", "gains_of_found_parts"]
+    than: str
+    """A method, or the sequence with its own parts."""
+    label: str
+    """The same in words."""
+    by_method: dict[str, dict[str, Difference]]
 
 
-def _differences(results: Results, sequence: str, than: str, changes: dict[str, dict[str, Difference]]) -> list[str]:
-    """The paired differences of methods, by score, as a table with a line above it; nothing without pairs."""
-    known = [score for score in _of_scenes(results.spec) if any(row[score].count for row in changes.values())]
+def _comparisons(results: Results, sequence: str) -> Iterator[Compared]:
+    """With the reference, and of found parts with a sequence's own; not of masks, whose scores all methods share."""
+    spec, than = results.spec, results.spec.reference
+    scores = [score for score in spec.scores if all_scores()[score].group != "masks"]
+    others = [method for method in spec.methods if method != than]
+    changes = {m: {s: results.difference(s, m, than, sequence) for s in scores} for m in others}
+    yield Compared("differences", than, spec.label(than), changes)
+    if own := spec.with_own_parts(sequence):
+        changes = {m: {s: results.gain_of_found(s, m, sequence, own) for s in scores} for m in spec.methods}
+        parts = " and ".join(spec.sequences[sequence].found_parts)
+        yield Compared("gains_of_found_parts", own, f"{own}, which has its own {parts}", changes)
+
+
+def _differences(results: Results, sequence: str, compared: Compared) -> list[str]:
+    """A table with a line above it; nothing without pairs."""
+    rows = compared.by_method
+    known = [score for score in next(iter(rows.values()), {}) if any(row[score].count for row in rows.values())]
     if not known:
         return []
     headings = [all_scores()[score].heading(sequence in results.relative) for score in known]
-    rows = [[results.spec.label(method), *(change(s, row[s]) for s in known)] for method, row in changes.items()]
-    lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
-    over_frames = any(row[s].over_frames for row in changes.values() for s in known)
+    lines = [[results.spec.label(method), *(change(s, row[s]) for s in known)] for method, row in rows.items()]
+    over_frames = any(row[s].over_frames for row in rows.values() for s in known)
     over = "seeds and, where scores have values of frames, these" if over_frames else "seeds"
-    about = f"Paired difference to {than}, positive where better, [95 % interval over {over}]:"
-    return [about, "\n".join("| " + " | ".join(line) + " |" for line in lines)]
+    about = f"Paired difference to {compared.label}, positive where better, [95 % interval over {over}]:"
+    return [about, grid(["method", *headings], lines)]
 
 
 def change(score: str, difference: Difference) -> str:
@@ -189,12 +213,37 @@ def _searches(matrix: Matrix, mark: str) -> list[str]:
     if not matrix.searches:
         return []
     about = "Searched with the first seed and fold; the others train with the threshold found."
-    return [f"{mark} Thresholds found", about, "\n".join(matched_table(matrix.spec, matrix.searches))]
+    return [f"{mark} Thresholds found", about, matched_table(matrix.spec, matrix.searches)]
 
 
 def _silent(matrix: Matrix, mark: str) -> list[str]:
     lines = silent_rules(matrix)
     return [f"{mark} Rules that never fired", "\n".join(f"- {line}." for line in lines)] if lines else []
+
+
+def silent_rules(matrix: Matrix) -> list[str]:
+    """A line for each method and sequence with a rule of density control that no Gaussian met in any cell.
+
+    What a table says of such a rule is an artifact.
+    """
+    spec, lines = matrix.spec, []
+    for sequence in spec.sequences:
+        for method in spec.methods:
+            folders = [f for cell, f in matrix.done.items() if (cell.sequence, cell.method) == (sequence, method)]
+            grown = [growth for folder in folders if (growth := growth_of(folder / "run"))]
+            changes = Counter[str]()
+            for growth in grown:
+                changes.update(growth.changes)
+            words = (
+                [] if changes["cloned"] + changes["split"] else ["nothing grew" if changes else "nothing grew or went"]
+            )
+            for name, count in changes.items():
+                if name.startswith("removed_") and not count:
+                    words.append(f"the rule {name.removeprefix('removed_')} removed nothing")
+            if grown and words:
+                events = sum(growth.num_events for growth in grown)
+                lines.append(f"{spec.label(method)}, {sequence}: {', '.join(words)} in {events} density events")
+    return lines
 
 
 def sentence(results: Results, claim: ClaimSpec) -> str:
@@ -210,7 +259,7 @@ def sentence(results: Results, claim: ClaimSpec) -> str:
 
 
 def _figures(matrix: Matrix, results: Results, folder: Path) -> None:
-    kinds = set(matrix.spec.figures)
+    kinds: set[str] = set(matrix.spec.figures)
     if not matrix.done:
         return
     if "budgets" in kinds:
@@ -241,29 +290,19 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         found = {name: {"verdict": said} | _json(own) for name, (own, said) in results.check(claim).items()}
         about = {"sequences": found, "together": _json(results.together(claim)), "sentence": sentence(results, claim)}
         claims.append(to_dict(claim) | about)
-    differences = [
-        {"sequence": name, "method": method, "than": spec.reference, "score": score}
-        | _json(results.difference(score, method, spec.reference, name))
-        for name in spec.sequences
-        for method in spec.methods
-        if method != spec.reference
-        for score in _of_scenes(spec)
-    ]
-    gains_of_found = [
-        {"sequence": name, "than": own, "method": method, "score": score}
-        | _json(results.gain_of_found(score, method, name, own))
-        for name in spec.sequences
-        if (own := spec.with_own_parts(name))
-        for method in spec.methods
-        for score in _of_scenes(spec)
-    ]
-    missing = {cell.name: reason for cell, reason in matrix.missing.items()}
+    pairs = {"differences": [], "gains_of_found_parts": []}
+    for name in spec.sequences:
+        for compared in _comparisons(results, name):
+            pairs[compared.kind] += [
+                {"sequence": name, "method": method, "than": compared.than, "score": score} | _json(difference)
+                for method, row in compared.by_method.items()
+                for score, difference in row.items()
+            ]
     return {
         "spec": to_dict(spec) | {"folder": None},
         "commits": commits_of(matrix),
         "cells": cells,
-        "differences": differences,
-        "gains_of_found_parts": gains_of_found,
+        **pairs,
         "claims": claims,
         "silent_rules": silent_rules(matrix),
         "thresholds": [
@@ -271,7 +310,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
             | {"tried": [{"threshold": value, "gaussians": growth.last} for value, growth in search.tried]}
             for (s, m, b), search in matrix.searches.items()
         ],
-        "missing": missing,
+        "missing": {cell.name: reason for cell, reason in matrix.missing.items()},
     }
 
 

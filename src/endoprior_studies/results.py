@@ -80,8 +80,8 @@ class Results:
         if not a or a.keys() != b.keys():
             a, b = {-1 - ours.fold: self.value(ours, score)}, {-1 - ours.fold: self.value(theirs, score)}
         frames = tuple(sorted(a))
-        values = (np.array([of[i] for i in frames], float) for of in (a, b))
-        return Pair((ours.sequence, ours.budget), ours.seed, *values, frames)
+        ours_values, theirs_values = (np.array([of[i] for i in frames], float) for of in (a, b))
+        return Pair((ours.sequence, ours.budget), ours.seed, ours_values, theirs_values, frames)
 
     def _of_frames(self, cell: Cell, score: str) -> dict[int, float]:
         """Values of single frames; none where the score is not their mean, as a plugin's need not be."""

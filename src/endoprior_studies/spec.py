@@ -177,13 +177,7 @@ class Spec:
         return isinstance(method_named(self.methods[method].name).options, Config)
 
     def config(
-        self,
-        method: str,
-        sequence: str,
-        budget: int | None,
-        seed: int,
-        threshold: float | None = None,
-        fold: int = 0,
+        self, method: str, sequence: str, budget: int | None, seed: int, threshold: float | None = None, fold: int = 0
     ) -> Any:
         """The full options of one cell: a `Config`, or the dataclass of a method that has options of its own.
 

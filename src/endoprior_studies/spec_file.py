@@ -1,9 +1,10 @@
-"""Read a spec from a YAML or TOML file, and check it completely before anything runs."""
+"""Find a spec by name or path, read it from YAML or TOML, and check it completely before anything runs."""
 
 from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -21,12 +22,57 @@ from endoprior.evaluation.registry import all_scores
 from endoprior.model.presets import preset_names
 
 from .method import PICTURES, method_names
-from .spec import MatchSpec, MethodSpec, Spec, cells
+from .spec import MatchSpec, MethodSpec, SequenceSpec, Spec, cells
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
 MOST_EXTENDED = 8
+FOLDER = Path(__file__).parent / "specs"
+"""Specs that come with the program. `endoprior bench` takes them by name: `quick`, `sized`, `sized/growth`."""
+READERS: dict[str, Callable[[str], Any]] = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
 MOST_CELLS = 100_000
+
+
+def spec_names() -> list[str]:
+    """Names of the specs, and of the folders of specs, that come with the program."""
+    files = [path.relative_to(FOLDER).with_suffix("") for path in _specs(FOLDER, "**/*")]
+    folders = {path.parent for path in files} - {Path()}
+    return sorted(path.as_posix() for path in {*files, *folders})
+
+
+def find_spec(name_or_path: str) -> Path:
+    """The file or folder of a name or path.
+
+    Args:
+        name_or_path: a name wins over a path: with a folder `quick` of your own, write `./quick`.
+    Raises:
+        InputError: neither a name nor a path that exists.
+    """
+    names = spec_names()
+    if name_or_path in names:
+        folder = FOLDER / name_or_path
+        return folder if folder.is_dir() else folder.with_suffix(".yaml")
+    if not Path(name_or_path).exists():
+        raise input_error(name_or_path, f"a file, a folder or one of {', '.join(names)}", "neither", "correct SPEC.")
+    return Path(name_or_path)
+
+
+def specs_of(path: Path) -> list[Path]:
+    """The spec itself, or those of a folder, sorted by name.
+
+    Raises:
+        InputError: the folder holds no specs.
+    """
+    if not path.is_dir():
+        return [path]
+    if specs := _specs(path, "*"):
+        return specs
+    raise input_error(path, ".yaml or .toml files", "none", "Pass a folder of specs.")
+
+
+def _specs(folder: Path, pattern: str) -> list[Path]:
+    """Spec files. One that starts with `_` is only there to be extended."""
+    return sorted(path for path in folder.glob(pattern) if path.suffix in READERS and path.name[0] != "_")
 
 
 def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
@@ -77,8 +123,7 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
     Raises:
         InputError: a file cannot be read, or extends itself.
     """
-    readers = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
-    if path.suffix not in readers:
+    if path.suffix not in READERS:
         raise input_error(path, "a .yaml or .toml file", f"{path.suffix or 'no suffix'}", "rename it.")
     text = read_text(path, "a readable file", "Correct the path.")
     if path.resolve() in chain:
@@ -86,7 +131,7 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
     if len(chain) >= MOST_EXTENDED:
         raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Fix: Merge some.")
     try:
-        values = readers[path.suffix](text)
+        values = READERS[path.suffix](text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # such as a number of 5000 digits
         raise input_error(path, f"valid {path.suffix[1:]}", f"{error}", "correct it.") from None
     extends = values.pop("extends", []) if isinstance(values, dict) else None
@@ -110,91 +155,102 @@ def _single_claims(claim: Any, place: int) -> list[Any]:
     return [claim | dict(zip(lists, chosen, strict=True)) for chosen in product(*lists.values())]
 
 
+def _demand(sound: object, where: str, expected: str, got: str, fix: str) -> None:
+    if not sound:
+        raise input_error(where, expected, got, fix)
+
+
+def _demand_one_of(where: str, name: str, choice: Iterable[str], fix: str = "choose one.") -> None:
+    known = [*choice]
+    _demand(name in known, where, f"one of {', '.join(known) or 'none'}", f"{name!r}", fix)
+
+
 def _check(spec: Spec) -> None:
-    for kind, names in (("sequences", spec.sequences), ("methods", spec.methods)):
-        for name in names:
-            if not NAME.fullmatch(name):
-                raise input_error(kind, "a name of letters, digits and . _ + -", f"{name!r}", "rename it.")
-        if len({name.lower() for name in names}) < len(names):  # figures have these names
-            raise input_error(kind, "names that differ in more than case", ", ".join(names), "rename one.")
+    _check_names(spec)
     for name, sequence in spec.sequences.items():
-        if bool(sequence.path) == (sequence.phantom is not None):
-            raise input_error(f"sequences.{name}", "either path or phantom", "both or none", "keep one.")
-        if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
-            raise InputError(f"sequences.{name}: a phantom has its own size. Fix: Remove shrink and first_frames.")
-        if sequence.format != "auto" and sequence.format not in LAYOUTS.names():
-            want = f"auto, {', '.join(LAYOUTS.names())}"
-            raise input_error(f"sequences.{name}.format", want, repr(sequence.format), "see docs/datasets.md.")
-        folds = {fold for fold in sequence.folds if 0 <= fold < TEST_EVERY}
-        if not folds or len(folds) < len(sequence.folds):
-            want = f"different numbers from 0 to {TEST_EVERY - 1}"
-            raise input_error(f"sequences.{name}.folds", want, f"{list(sequence.folds)}", "correct them.")
+        _check_sequence(f"sequences.{name}", sequence)
     known = [name for name in method_names() if name != PICTURES]
     for name in spec.set_for:
-        if name not in known:
-            raise input_error("set_for", f"one of {', '.join(known)}", f"{name!r}", "choose one.")
+        _demand_one_of("set_for", name, known)
     for name, method in spec.methods.items():
         _check_method(spec, f"methods.{name}", method, known)
     for name, method in spec.methods.items():
         if method.match:
             _check_match(spec, name, method.match)
-    named = [spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))]
-    for name in named:
-        if name not in spec.methods:
-            raise input_error("claims, compare_with", f"one of {', '.join(spec.methods)}", f"{name!r}", "correct it.")
+    for name in (spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))):
+        _demand_one_of("claims, compare_with", name, spec.methods)
     for name in (*spec.scores, *(claim.score for claim in spec.claims)):
-        if name not in all_scores():
-            raise input_error("scores, claims", "names of scores", f"{name!r}", "see docs/scores.md.")
+        _demand(name in all_scores(), "scores, claims", "names of scores", f"{name!r}", "see docs/scores.md.")
     for name in spec.protocols:
-        if name not in (known := PROTOCOLS.names()):
-            raise input_error("protocols", f"one of {', '.join(known)}", f"{name!r}", "choose one.")
-    if len(set(spec.protocols)) < len(spec.protocols):
-        raise input_error("protocols", "different names", ", ".join(spec.protocols), "remove one.")
-    if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
-        raise input_error("seeds", "different numbers", f"{list(spec.seeds)}", "correct them.")
+        _demand_one_of("protocols", name, PROTOCOLS.names())
+    _check_cells(spec)
+
+
+def _check_names(spec: Spec) -> None:
+    for kind, names in (("sequences", spec.sequences), ("methods", spec.methods)):
+        for name in names:
+            _demand(NAME.fullmatch(name), kind, "a name of letters, digits and . _ + -", f"{name!r}", "rename it.")
+        differ = len({name.lower() for name in names}) == len(names)  # figures have these names
+        _demand(differ, kind, "names that differ in more than case", ", ".join(names), "rename one.")
+    for where, what, values in (("protocols", "names", spec.protocols), ("seeds", "numbers", spec.seeds)):
+        _demand(len(set(values)) == len(values), where, f"different {what}", f"{[*values]}", "correct them.")
+    _demand(spec.seeds, "seeds", "different numbers", "none", "add one.")
+
+
+def _check_cells(spec: Spec) -> None:
     folds = sum(len(sequence.folds) for sequence in spec.sequences.values())
     count = len(spec.seeds) * folds * max(len(spec.budgets), 1) * len(spec.methods)
-    if count > MOST_CELLS:
-        raise input_error("methods x sequences x budgets x seeds", f"at most {MOST_CELLS}", f"{count}", "split.")
+    where = "methods x sequences x budgets x seeds"
+    _demand(count <= MOST_CELLS, where, f"at most {MOST_CELLS}", f"{count}", "split.")
     for cell in cells(spec):
         options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed, fold=cell.fold)
+        if not spec.has_config(cell.method):
+            continue
         found, where = spec.sequences[cell.sequence].found_parts, f"sequences.{cell.sequence}"
-        if "masks" in found and spec.has_config(cell.method) and options.data.use_gt_masks:
+        if "masks" in found and options.data.use_gt_masks:
             raise input_error(f"{where}.masks", "either found or gt_masks", "both", "remove data.use_gt_masks.")
-        if "poses" in found and spec.has_config(cell.method) and options.data.depth_unit_mm:
+        if "poses" in found and options.data.depth_unit_mm:
             fix = "write the unit to sequence.json as depth_scale."
             raise input_error(f"{where}.poses", "either estimated or data.depth_unit_mm", "both", fix)
 
 
+def _check_sequence(where: str, sequence: SequenceSpec) -> None:
+    has_one = bool(sequence.path) != (sequence.phantom is not None)
+    _demand(has_one, where, "either path or phantom", "both or none", "keep one.")
+    if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
+        raise InputError(f"{where}: a phantom has its own size. Fix: Remove shrink and first_frames.")
+    known = ("auto", *LAYOUTS.names())
+    _demand(
+        sequence.format in known, f"{where}.format", ", ".join(known), repr(sequence.format), "see docs/datasets.md."
+    )
+    folds = {fold for fold in sequence.folds if 0 <= fold < TEST_EVERY}
+    want = f"different numbers from 0 to {TEST_EVERY - 1}"
+    sound = folds and len(folds) == len(sequence.folds)
+    _demand(sound, f"{where}.folds", want, f"{[*sequence.folds]}", "correct them.")
+
+
 def _check_match(spec: Spec, name: str, match: MatchSpec) -> None:
-    where = f"methods.{name}.match"
-    if [bool(match.count_of), match.growth != 0, bool(match.value_of)].count(True) != 1:
-        raise input_error(where, "one of count_of, growth and value_of", "none or several", "keep one.")
-    if not spec.has_config(name):
-        raise input_error(where, "a method with our config", spec.methods[name].name, "remove match.")
-    if match.growth and not match.growth > 0:
-        raise input_error(f"{where}.growth", "a number above 0", f"{match.growth}", "correct it.")
-    if match.count_of and (match.count_of not in spec.methods or spec.methods[match.count_of].match):
-        choice = ", ".join(other for other, about in spec.methods.items() if not about.match)
-        raise input_error(f"{where}.count_of", f"one of {choice}", repr(match.count_of), "choose one.")
-    searched = [n for n, about in spec.methods.items() if about.match and not about.match.value_of]
-    if match.value_of and match.value_of not in searched:
-        choice = f"one of {', '.join(searched)}" if searched else "a method with a search"
-        raise input_error(f"{where}.value_of", choice, repr(match.value_of), "choose one.")
+    where, methods = f"methods.{name}.match", spec.methods
+    given = [bool(match.count_of), match.growth != 0, bool(match.value_of)]
+    _demand(given.count(True) == 1, where, "one of count_of, growth and value_of", "none or several", "keep one.")
+    _demand(spec.has_config(name), where, "a method with our config", methods[name].name, "remove match.")
+    _demand(match.growth >= 0, f"{where}.growth", "a number above 0", f"{match.growth}", "correct it.")
+    if match.count_of:
+        _demand_one_of(f"{where}.count_of", match.count_of, (n for n, about in methods.items() if not about.match))
+    if match.value_of:
+        searched = (n for n, about in methods.items() if about.match and not about.match.value_of)
+        _demand_one_of(f"{where}.value_of", match.value_of, searched)
 
 
 def _check_method(spec: Spec, where: str, method: MethodSpec, known: list[str]) -> None:
-    if bool(method.preset) + bool(method.method) + bool(method.pictures) > 1:
-        raise input_error(where, "one of preset, method and pictures", "several", "keep one.")
+    kinds = [method.preset, method.method, method.pictures]
+    _demand(sum(map(bool, kinds)) <= 1, where, "one of preset, method and pictures", "several", "keep one.")
     for key, name, choice in (("preset", method.preset, preset_names()), ("method", method.method, known)):
-        if name and name not in choice:
-            raise input_error(f"{where}.{key}", f"one of {', '.join(choice)}", f"{name!r}", "choose one.")
-    if not method.pictures and (method.depth_pictures or method.depth_scale):
-        raise input_error(where, "depth_pictures and depth_scale beside pictures", "no pictures", "add pictures.")
+        if name:
+            _demand_one_of(f"{where}.{key}", name, choice)
+    alone = not method.pictures and (method.depth_pictures or method.depth_scale)
+    _demand(not alone, where, "depth_pictures and depth_scale beside pictures", "no pictures", "add pictures.")
     for key, folders in (("pictures", method.pictures), ("depth_pictures", method.depth_pictures)):
         for name, path in folders.items():
-            if name not in spec.sequences:
-                choice = ", ".join(spec.sequences)
-                raise input_error(f"{where}.{key}", f"one of {choice}", f"{name!r}", "correct the name.")
-            if not path:
-                raise input_error(f"{where}.{key}.{name}", "a folder", "nothing", "name it or remove the entry.")
+            _demand_one_of(f"{where}.{key}", name, spec.sequences)
+            _demand(path, f"{where}.{key}.{name}", "a folder", "nothing", "name it or remove the entry.")

@@ -1,18 +1,22 @@
-"""Results as tables in Markdown and LaTeX, and all single values as CSV."""
+"""Results as tables in Markdown and LaTeX, also those under the protocols of other papers, and all values as CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from endoprior.evaluation.protocols.table import KEYS, PROTOCOLS, SCORES
 from endoprior.evaluation.registry import all_scores
 from endoprior.evaluation.score import Score
 
+from .matched_count import Place, Search, matches_of
+from .matrix import Matrix, scores_of
 from .results import Results
+from .spec import MatchSpec, Spec
 from .statistics import Summary
 
 
@@ -95,9 +99,13 @@ def _decimals(size: float, significant: int) -> int:
 def markdown(table: Table) -> str:
     """The table in Markdown: best in bold, second best underlined by `<u>`."""
     marks = {0: "{}", 1: "**{}**", 2: "<u>{}</u>"}
-    lines = [["method", *table.columns], ["---"] * (len(table.columns) + 1)]
-    lines += [[name, *(marks[e.rank].format(e.text) for e in entries)] for name, entries in table.rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    rows = ([name, *(marks[e.rank].format(e.text) for e in entries)] for name, entries in table.rows)
+    return grid(["method", *table.columns], rows)
+
+
+def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *rows))
 
 
 def latex(table: Table) -> str:
@@ -108,19 +116,9 @@ def latex(table: Table) -> str:
         return marks[entry.rank].format(entry.text.replace("±", r"$\pm$").replace(",", r"{,}"))
 
     lines = [" & ".join([_escaped(name), *map(cell, entries)]) + r" \\" for name, entries in table.rows]
-    heads = " & ".join(["method", *map(_escaped, table.columns)])
-    return "\n".join(
-        [
-            rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
-            rf"% {table.title}",
-            r"\toprule",
-            heads + r" \\",
-            r"\midrule",
-            *lines,
-            r"\bottomrule",
-            r"\end{tabular}",
-        ]
-    )
+    heads = " & ".join(["method", *map(_escaped, table.columns)]) + r" \\"
+    begin = [rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}", rf"% {table.title}", r"\toprule"]
+    return "\n".join([*begin, heads, r"\midrule", *lines, r"\bottomrule", r"\end{tabular}"])
 
 
 def _escaped(text: str) -> str:
@@ -139,3 +137,71 @@ def csv_lines(results: Results, more: Sequence[tuple[Any, ...]] = ()) -> str:
             writer.writerow([cell.sequence, cell.method, cell.budget or "", cell.seed, cell.fold, name, repr(value)])
     writer.writerows(more)
     return text.getvalue()
+
+
+def protocol_tables(matrix: Matrix) -> list[Table]:
+    """A table for each protocol and sequence that has a score."""
+    return [table for name in matrix.spec.protocols for table in _tables(matrix, name).values()]
+
+
+def protocol_blocks(matrix: Matrix, mark: str) -> list[str]:
+    """The blocks of `results.md`: for each protocol what it is, its tags on each sequence, and its tables."""
+    blocks: list[str] = []
+    for name in matrix.spec.protocols:
+        about, tables = PROTOCOLS.load(name), _tables(matrix, name)
+        published = "; ".join(f"{KEYS[tag]}: {text}" for tag, text in about.paper)
+        blocks.append(f"{mark} Protocol {name}")
+        blocks.append(f"As {about.title} is scored ({about.source}). As published: {published}.")
+        blocks += ["\n".join(f"- {sentence}" for sentence in about.differs)] if about.differs else []
+        for sequence in matrix.data:
+            cells = [
+                scores_of(matrix.done[cell])["protocols"][name] for cell in matrix.done if cell.sequence == sequence
+            ]
+            for tags in dict.fromkeys(_tags(cell) for cell in cells if cell["tags"]):
+                blocks.append(f"{sequence}, scored here: {tags}.")
+            if sequence in tables:
+                blocks.append(markdown(tables[sequence]))
+            if skipped := dict.fromkeys(SCORES[score].label for cell in cells for score in cell["skipped"]):
+                blocks.append(f"Not computed on {sequence}: {', '.join(skipped)}; `results.json` has the reasons.")
+    return blocks
+
+
+def protocol_values(matrix: Matrix) -> list[tuple[Any, ...]]:
+    """Rows for `results.csv`; the score is named `endonerf/psnr`."""
+    return [
+        (cell.sequence, cell.method, cell.budget or "", cell.seed, cell.fold, f"{name}/{score}", repr(value))
+        for name in matrix.spec.protocols
+        for cell, scores in Results.of(matrix, name).scores.items()
+        for score, value in scores.items()
+    ]
+
+
+def _tables(matrix: Matrix, name: str) -> dict[str, Table]:
+    results = Results.of(matrix, name)
+    tables = {sequence: score_table(results, sequence, SCORES, f"{sequence}, {name}") for sequence in matrix.data}
+    return {sequence: table for sequence, table in tables.items() if table.columns}
+
+
+def _tags(cell: dict[str, Any]) -> str:
+    return "; ".join(f"{KEYS[tag]}: {text}" for tag, text in cell["tags"].items())
+
+
+def matched_table(spec: Spec, searches: dict[Place, Search]) -> str:
+    """A Markdown table: what was wanted, and what was found."""
+    matches, rows = matches_of(spec), []
+    for (sequence, method, budget), search in searches.items():
+        name = spec.label(method) + (f", {budget:,}" if budget else "")
+        rows.append([name, sequence, *_words(matches[sequence, method, budget], search), str(len(search.tried))])
+    return grid(("method", "sequence", "threshold of growth", "Gaussians", "wanted", "trainings"), rows)
+
+
+def _words(match: MatchSpec, search: Search) -> tuple[str, str, str]:
+    """The threshold, what it gave and what was wanted, in words."""
+    if search.failure:
+        return f"none: {search.failure}", "-", "-"
+    value = f"{search.best[0]:.3g}"
+    if match.value_of:
+        return value, "-", f"threshold of {match.value_of}"
+    why = f"as {match.count_of}" if match.count_of else f"{match.growth:g} times the start"
+    missed = "" if search.matched else " (not reached)"
+    return value, f"{search.best[1].last:,}{missed}", f"{search.target:,.0f}: {why}"

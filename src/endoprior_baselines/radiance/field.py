@@ -12,10 +12,9 @@ from torch import Generator, Tensor, nn
 
 from endoprior.system.arrays_file import ArraySpec
 
-from .compositing import Composited
-from .config import RadianceConfig
-from .frames import RayFrames
-from .rays import Rays
+from .presets import RadianceConfig
+from .rays import RayFrames, Rays
+from .sampling import Composited
 
 
 @dataclass(frozen=True)

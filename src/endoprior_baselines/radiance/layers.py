@@ -1,11 +1,35 @@
-"""Linear layers whose first weights come from a given generator, never from the global one."""
+"""Frequency encoding, and linear layers whose first weights come from a given generator, never from the global one."""
 
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import torch
 from torch import Generator, Tensor, nn
+
+
+def encoded_size(dims: int, num: int) -> int:
+    """Length of the encoding of `dims` numbers with `num` frequencies."""
+    return dims * (1 + 2 * num)
+
+
+def encoded(x: Tensor, num: int) -> Tensor:
+    """(..., D (1 + 2 num)) x (..., D), then sin(2^k x) and cos(2^k x) for k < `num`: NeRF's encoding without factor pi.
+
+    A small network cannot fit fine detail of its raw inputs.
+    """
+    waves = [wave(x * 2.0**k) for k in range(num) for wave in (torch.sin, torch.cos)]
+    return torch.cat([x, *waves], -1)
+
+
+def encoded_change(x: Tensor, dx: Tensor, num: int) -> Tensor:
+    """How `encoded(x)` changes when x changes along `dx` (..., D): its directional derivative."""
+    parts = [dx]
+    for k in range(num):
+        angle, rate = x * 2.0**k, dx * 2.0**k
+        parts += [torch.cos(angle) * rate, -torch.sin(angle) * rate]
+    return torch.cat(parts, -1)
 
 
 class Linear(nn.Linear):
@@ -50,6 +74,21 @@ class NormedLinear(nn.Module):
     def measure(self) -> None:
         """Make `weight` what `direction` is now."""
         self.length.copy_(self.direction.norm(dim=1, keepdim=True))
+
+
+def start(network: nn.Module, generator: Generator) -> None:
+    """Give every layer its first values."""
+    for layer in network.modules():
+        if isinstance(layer, Linear | NormedLinear):
+            layer.start(generator)
+
+
+Layer = TypeVar("Layer", bound=nn.Module)
+
+
+def layers_of(network: nn.Module, kind: type[Layer]) -> list[Layer]:
+    """The layers of a kind in a network, in the order in which it was built."""
+    return [layer for layer in network.modules() if isinstance(layer, kind)]
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""A method that is a radiance field."""
+"""The methods that are radiance fields."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from torch import Tensor
+from typing_extensions import override
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
@@ -15,8 +16,11 @@ from endoprior.model.method import Method
 from endoprior.model.scene_facts import SceneFacts
 from endoprior.system.arrays_file import ArraySpec, part
 
-from .config import RadianceFieldConfig
+from . import presets
+from .endonerf import EndoNeRF
+from .endosurf import EndoSurf
 from .field import RadianceField
+from .presets import RadianceFieldConfig, radiance_of
 from .scene import RadianceScene
 from .trainer import RadianceTrainer
 
@@ -29,25 +33,28 @@ class RadianceMethod(Method):
     only: Mapping[str, Any] = {"data.eyes": "left", "init.motion": "rest"}
 
     def __init__(self, kind: type[RadianceField], config: Callable[[], Config]) -> None:
-        """Args: kind: of the field. config: what its preset starts from."""
         self.kind, self._config = kind, config
 
     def config(self) -> Config:
         """What its preset starts from."""
         return self._config()
 
+    @override
     def trainer(self, sequence: FrameSequence, cfg: Config) -> RadianceTrainer:
-        """See `Method.trainer`."""
         return RadianceTrainer(sequence, cfg, self.kind)
 
+    @override
     def schema(self, cfg: Config) -> dict[str, ArraySpec]:
-        """See `Method.schema`."""
-        return {f"field.{name}": spec for name, spec in self.kind.schema(cfg.radiance).items()}
+        return {f"field.{name}": spec for name, spec in self.kind.schema(radiance_of(cfg)).items()}
 
+    @override
     def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> RadianceScene:
-        """See `Method.scene`."""
-        field = self.kind(facts.config.radiance)
+        field = self.kind(radiance_of(facts.config))
         field.load_state_dict(part(arrays, "field."))
         if wrong := field.wrong_values():
             raise InputError(f"expected {wrong}; got something else.")
         return RadianceScene(field, facts.config, cameras, facts.frames_per_second, facts.lengths_are_relative)
+
+
+ENDONERF = RadianceMethod(EndoNeRF, presets.endonerf)
+ENDOSURF = RadianceMethod(EndoSurf, presets.endosurf)

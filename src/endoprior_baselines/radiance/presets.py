@@ -1,15 +1,48 @@
-"""The configs of the two radiance fields: a size for two CPU cores, and the published schedule."""
+"""The configs of the two radiance fields, `endonerf` and `endosurf`: sized for two CPU cores, and as published."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 from endoprior.core.config import Config
+from endoprior.core.ranges import Checked, Count, Range
 from endoprior.model.presets import paper
 
-from .config import RadianceConfig, RadianceFieldConfig
-
 SIZED_ITERATIONS, PUBLISHED_ITERATIONS = 2_000, 100_000
+
+
+@dataclass(frozen=True)
+class RadianceConfig(Checked):
+    """Rays and samples of a radiance field.
+
+    Its rates reach 1e-2 at most: beyond that no such network learns anything.
+    """
+
+    rays: Annotated[int, Range(1, 65_536)] = 512
+    """Rays of one training frame in each iteration."""
+    even_samples: Annotated[int, Range(4, 1024)] = 32
+    """Samples of a ray that are placed first: evenly, or around measured depth."""
+    more_samples: Annotated[int, Range(4, 1024)] = 32
+    """Samples of a ray that are placed where the first ones found a surface."""
+    learning_rate: Annotated[float, Range(1e-30, 1e-2)] = 5e-4
+    """Adam's highest rate."""
+    refine_every: Count = 0
+    """EndoNeRF renders the depth of all training frames and corrects outliers after so many iterations, four times;
+    0 never does."""
+
+
+@dataclass(frozen=True)
+class RadianceFieldConfig(Config):
+    """See `Config`."""
+
+    radiance: RadianceConfig = field(default_factory=RadianceConfig)
+
+
+def radiance_of(cfg: Config) -> RadianceConfig:
+    """What the config of a radiance field has beside `endoprior.Config`."""
+    assert isinstance(cfg, RadianceFieldConfig)
+    return cfg.radiance
 
 
 def endonerf() -> Config:

@@ -1,21 +1,23 @@
-"""Where a ray is sampled: depths, or distances, in ascending order. Random numbers are passed in, never made here."""
+"""Where a ray is sampled, in ascending order, and what it shows: NeRF's alpha, NeuS's alpha, and the sum.
+
+Random numbers are passed in, never made here.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+LAST = 1e10
+"""Length of the interval behind the last sample: whatever is dense there is opaque."""
 FLOOR = 1e-5
 """Added to every weight, so that a ray without weights is sampled evenly."""
 
 
 def jittered(values: Tensor, shares: Tensor | None) -> Tensor:
-    """Ascending samples moved at random within the halves of the gaps to their neighbors; None leaves them.
-
-    Args:
-        values: (N, S).
-        shares: (N, S) in [0, 1).
-    """
+    """Ascending samples (N, S) moved by `shares` (N, S) in [0, 1) of half the gaps to their neighbors; None: not."""
     if shares is None:
         return values
     middles = (values[:, 1:] + values[:, :-1]) / 2
@@ -31,14 +33,9 @@ def even(near: Tensor, far: Tensor, num: int) -> Tensor:
 
 
 def by_weight(edges: Tensor, weights: Tensor, places: Tensor) -> Tensor:
-    """Samples distributed like the weights of intervals: the inverse of their cumulative distribution.
+    """(N, K) samples distributed like the weights (N, S) of intervals with ascending ends `edges` (N, S + 1).
 
-    Args:
-        edges: (N, S + 1) ascending ends of the intervals.
-        weights: (N, S) at least 0.
-        places: (N, K) in [0, 1], where the distribution is inverted.
-    Returns:
-        (N, K), ascending where `places` are.
+    The cumulative distribution is inverted at `places` (N, K) in [0, 1]; samples ascend where these do.
     """
     shares = weights + FLOOR
     shares = shares / shares.sum(-1, keepdim=True)
@@ -73,9 +70,7 @@ def surface_places(s: Tensor, distance: Tensor, inside: Tensor, sharpness: float
     right where the surface turns away within one interval.
 
     Args:
-        s: (N, S) ascending distances along the ray.
-        distance: (N, S) signed distance there.
-        inside: (N, S) whether a sample lies in the unit sphere.
+        s: (N, S) ascending distances along the ray. distance: signed distance there. inside: lies in the unit sphere.
     """
     step = s[:, 1:] - s[:, :-1]
     slope = (distance[:, 1:] - distance[:, :-1]) / (step + 1e-5)
@@ -91,3 +86,45 @@ def weights_of(alpha: Tensor) -> Tensor:
     """(N, S) share of each sample in its ray: its alpha times what the samples before it let through."""
     through = torch.cumprod(1 - alpha + 1e-7, -1)
     return alpha * torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], -1)
+
+
+@dataclass(frozen=True)
+class Composited:
+    """What `N` rays show."""
+
+    color: Tensor
+    """(N, 3)."""
+    depth: Tensor
+    """(N,) sum of weight times depth, in the depth's unit; not divided by alpha."""
+    alpha: Tensor
+    """(N,) sum of weights."""
+    weights: Tensor
+    """(N, S)."""
+
+
+def composited(alpha: Tensor, color: Tensor, depth: Tensor) -> Composited:
+    """Blend samples of alpha (N, S) in [0, 1], color (N, S, 3) and depth (N, S) front to back over black."""
+    weights = weights_of(alpha)
+    return Composited((weights[..., None] * color).sum(1), (weights * depth).sum(1), weights.sum(1), weights)
+
+
+def density_alpha(density: Tensor, depth: Tensor) -> Tensor:
+    """1 - exp(-density x interval): NeRF's alpha, of density (N, S) before the ReLU at ascending depth (N, S)."""
+    last = torch.full_like(depth[:, :1], LAST)
+    return 1 - torch.exp(-torch.relu(density) * torch.cat([depth[:, 1:] - depth[:, :-1], last], -1))
+
+
+def surface_alpha(distance: Tensor, slope: Tensor, step: Tensor, sharpness: Tensor, anneal: float) -> Tensor:
+    """NeuS's alpha: how much of the logistic distribution around the surface a step takes in.
+
+    With the slope c of the distance along the ray, the distance is d - c step / 2 where the step begins and d + c step
+    / 2 where it ends; alpha = (S(begin) - S(end)) / S(begin), with S the sigmoid of sharpness times distance. At first
+    a surface that faces away counts half, so that gradients reach it: `anneal` goes from 0 to 1.
+
+    Args:
+        distance: (N, S) in the middle of each `step`. slope: its change along the ray, -1 where that meets it head on.
+    """
+    facing = -(torch.relu(0.5 - 0.5 * slope) * (1 - anneal) + torch.relu(-slope) * anneal)
+    enter = torch.sigmoid((distance - facing * step / 2) * sharpness)
+    leave = torch.sigmoid((distance + facing * step / 2) * sharpness)
+    return ((enter - leave + 1e-5) / (enter + 1e-5)).clamp(0, 1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from typing_extensions import override
 
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, RenderedView
@@ -17,6 +18,7 @@ from endoprior.render import Backend
 from endoprior.system.arrays_file import save_arrays
 
 from .field import RadianceField
+from .presets import radiance_of
 from .rays import all_rays
 
 SAMPLES_AT_ONCE = {"cpu": 2**13, "cuda": 2**15}
@@ -34,37 +36,44 @@ class RadianceScene(RenderedScene):
     lengths_are_relative: bool = False
 
     @property
+    @override
     def device(self) -> torch.device:
-        """See `RenderedScene.device`."""
         return self.field.device
 
     @property
+    @override
     def backend(self) -> str:
-        """See `RenderedScene.backend`."""
-        return f"torch, {self.config.radiance.even_samples + self.config.radiance.more_samples} samples per ray"
+        return f"torch, {self.samples} samples per ray"
 
+    @property
+    def samples(self) -> int:
+        """Of each ray."""
+        radiance = radiance_of(self.config)
+        return radiance.even_samples + radiance.more_samples
+
+    @override
     def to(
         self, device: torch.device | str, *, backend: Backend | None = None, fp16_planes: bool = False
     ) -> RadianceScene:
-        """See `RenderedScene.to`; `backend` and `fp16_planes` have no meaning here."""
+        """`backend` and `fp16_planes` have no meaning here."""
         if torch.device(device) == self.device:
             return self
         return replace(self, field=deepcopy(self.field).to(device))
 
+    @override
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
-        """See `RenderedScene.render`. Rays go through the networks in groups, so that memory is bounded."""
+        """Rays go through the networks in groups, so that memory is bounded."""
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
         camera = camera or self.camera_at(time)
-        rays, radiance = all_rays(camera, self.device), self.config.radiance
-        group = max(1, SAMPLES_AT_ONCE[self.device.type] // (radiance.even_samples + radiance.more_samples))
+        rays, group = all_rays(camera, self.device), max(1, SAMPLES_AT_ONCE[self.device.type] // self.samples)
         views = [self.field.render(rays.part(k, k + group), time) for k in range(0, len(rays), group)]
         size = (camera.height, camera.width)
         parts = [torch.cat([getattr(view, name) for view in views]) for name in ("color", "depth", "alpha")]
         return RenderedView(parts[0].reshape(*size, 3), parts[1].reshape(size), parts[2].reshape(size))
 
+    @override
     def save(self, path: Path) -> None:
-        """See `RenderedScene.save`."""
         arrays = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         arrays |= camera_arrays(self.cameras)
         save_arrays(path, arrays, scene_facts(self), FORMAT)

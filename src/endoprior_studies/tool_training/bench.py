@@ -46,8 +46,7 @@ def run(argv: list[str]) -> int:
     from endoprior.system.file_lock import locked
     from endoprior.tool_masks.network import network_from_file
 
-    from .leave_one_out import ALL, Training, rows, weights_file
-    from .report import write_report
+    from .leave_one_out import ALL, Training, rows, weights_file, write_report
 
     require_writable_folder("OUT", args.out)
     start = network_from_file(args.start) if args.start else None

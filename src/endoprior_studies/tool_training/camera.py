@@ -45,7 +45,7 @@ def photographed(rng: Generator, scene: Field, view: NDArray[np.bool_]) -> NDArr
     if rng.random() < 0.5:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.8))
     if rng.random() < 0.08:
-        image = _moved(rng, image)
+        image = cv2.filter2D(image, -1, motion_kernel(rng))
     if rng.random() < 0.3:
         small = rng.uniform(0.5, 0.85)
         image = cv2.resize(cv2.resize(image, None, fx=small, fy=small, interpolation=cv2.INTER_AREA), size[::-1])
@@ -62,7 +62,8 @@ def photographed(rng: Generator, scene: Field, view: NDArray[np.bool_]) -> NDArr
     image_u8 = _bordered(rng, image_u8, view)
     if rng.random() < 0.6:
         quality = int(rng.uniform(25, 95))
-        image_u8 = cv2.imdecode(cv2.imencode(".jpg", image_u8, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], 1)
+        stored = cv2.imencode(".jpg", image_u8, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        image_u8 = np.asarray(cv2.imdecode(stored, cv2.IMREAD_COLOR), np.uint8)
     return image_u8
 
 
@@ -85,14 +86,9 @@ def _smoked(rng: Generator, image: Field) -> Field:
     size = image.shape[:2]
     dense = rng.uniform(0.05, 0.7) if rng.random() < 0.7 else rng.uniform(0.5, 0.85)
     share = np.clip(dense * (1 + 0.6 * fractal_field(rng, size, log_uniform(rng, 40, 200), 4)), 0, 0.88)
-    tint = np.array([1, rng.uniform(0.75, 1.02), rng.uniform(0.6, 1.05)], np.float32) * np.float32(
-        rng.uniform(0.35, 0.9)
-    )
+    tint = np.array([1, rng.uniform(0.75, 1.02), rng.uniform(0.6, 1.05)], np.float32)
+    tint *= np.float32(rng.uniform(0.35, 0.9))
     return image + share[..., None] * (tint - image)
-
-
-def _moved(rng: Generator, image: Field) -> Field:
-    return cv2.filter2D(image, -1, motion_kernel(rng))
 
 
 def motion_kernel(rng: Generator) -> Field:
@@ -147,7 +143,7 @@ def _label(rng: Generator, image_u8: NDArray[np.uint8]) -> None:
 
 def shadowed(rng: Generator, tissue: Field, covered: Field) -> Field:
     """(h, w, 3) tissue in the shadow of an instrument that covers (h, w)."""
-    shift = np.float32([[1, 0, rng.normal(0, 8)], [0, 1, rng.normal(0, 8)]])
+    shift = np.array([[1, 0, rng.normal(0, 8)], [0, 1, rng.normal(0, 8)]], np.float32)
     shadow = cv2.warpAffine(covered, shift, covered.shape[::-1])
     width = int(log_uniform(rng, 2, 20))
     shadow = cv2.blur(cv2.blur(shadow, (width, width)), (width, width))

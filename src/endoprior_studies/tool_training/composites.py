@@ -41,6 +41,12 @@ class LabeledFrame:
     """(H, W) 0, 1 or `IGNORED`."""
 
 
+Frames = Sequence[Sequence[LabeledFrame]]
+"""The real frames of each set that may be used."""
+Scene = tuple[Field, NDArray[np.uint8]]
+"""(h, w, 3) colors and (h, w) labels."""
+
+
 @dataclass(frozen=True)
 class Example:
     """One image and what it shows."""
@@ -53,16 +59,15 @@ class Example:
     """(h, w) 0, 1 or `IGNORED`."""
 
 
-def examples(rng: Generator, frames: Sequence[Sequence[LabeledFrame]], number: int = 2) -> list[Example]:
+def examples(rng: Generator, frames: Frames, number: int = 2) -> list[Example]:
     """Paint one scene and photograph it `number` times, with another camera, mirrored or not.
 
-    Args:
-        frames: the real frames of each set that may be used; without any, all tissue is procedural.
+    Without any real frames, all tissue is procedural.
     """
     scene, label, view = _scene(rng, frames)
     made = []
     for _ in range(number):
-        flip = (slice(None, None, rng.choice((-1, 1))), slice(None, None, rng.choice((-1, 1))))
+        flip = (slice(None, None, int(rng.choice((-1, 1)))), slice(None, None, int(rng.choice((-1, 1)))))
         rgb_u8 = photographed(rng, np.ascontiguousarray(scene[flip]), view[flip])
         told, beyond = view[flip], IGNORED
         if rng.random() < UNTOLD:
@@ -71,12 +76,13 @@ def examples(rng: Generator, frames: Sequence[Sequence[LabeledFrame]], number: i
     return made
 
 
-def _scene(
-    rng: Generator, frames: Sequence[Sequence[LabeledFrame]]
-) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
+def _scene(rng: Generator, frames: Frames) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
     """(h, w, 3) tissue with bodies over it, its labels, and the view."""
     real = bool(frames) and rng.random() < REAL
-    scene, label, view = _real_scene(rng, frames) if real else _procedural_scene(rng)
+    if real:
+        scene, label, view = _real_scene(rng, frames)
+    else:
+        scene, label, view = tissue(rng, SIZE), np.zeros(SIZE, np.uint8), random_view(rng, SIZE)
     if real and rng.random() < 0.15:  # as it is: real tools, or tissue without any
         return scene, label, view
     if rng.random() < 0.08:
@@ -93,13 +99,7 @@ def _scene(
     return scene, label, view
 
 
-def _procedural_scene(rng: Generator) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
-    return tissue(rng, SIZE), np.zeros(SIZE, np.uint8), random_view(rng, SIZE)
-
-
-def _real_scene(
-    rng: Generator, frames: Sequence[Sequence[LabeledFrame]]
-) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
+def _real_scene(rng: Generator, frames: Frames) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
     """A part of a real frame, mirrored and turned."""
     scene, label = _cropped(rng, _any(rng, frames))
     view = random_view(rng, SIZE) if rng.random() < 0.3 else np.ones(SIZE, bool)
@@ -107,13 +107,13 @@ def _real_scene(
     return scene, np.where(view, label, IGNORED).astype(np.uint8), view & ~(dark & (label == IGNORED))
 
 
-def _any(rng: Generator, frames: Sequence[Sequence[LabeledFrame]]) -> LabeledFrame:
+def _any(rng: Generator, frames: Frames) -> LabeledFrame:
     """A frame of any set; sets count alike, however many frames they have."""
-    chosen = frames[rng.integers(len(frames))]
-    return chosen[rng.integers(len(chosen))]
+    chosen = frames[int(rng.integers(len(frames)))]
+    return chosen[int(rng.integers(len(chosen)))]
 
 
-def _cropped(rng: Generator, frame: LabeledFrame) -> tuple[Field, NDArray[np.uint8]]:
+def _cropped(rng: Generator, frame: LabeledFrame) -> Scene:
     height, width = frame.label.shape
     turned = rng.random() < 0.3
     aspect = (SIZE[0] / SIZE[1]) ** (-1 if turned else 1) * log_uniform(rng, 0.8, 1.25)
@@ -130,12 +130,10 @@ def _cropped(rng: Generator, frame: LabeledFrame) -> tuple[Field, NDArray[np.uin
         image, label = image[::-1], label[::-1]
     image = cv2.resize(np.ascontiguousarray(image), SIZE[::-1], interpolation=cv2.INTER_AREA)
     label = cv2.resize(np.ascontiguousarray(label), SIZE[::-1], interpolation=cv2.INTER_NEAREST)
-    return image.astype(np.float32) / 255, label
+    return image.astype(np.float32) / 255, np.asarray(label, np.uint8)
 
 
-def _transferred(
-    rng: Generator, scene: Field, label: NDArray[np.uint8], frames: Sequence[Sequence[LabeledFrame]]
-) -> tuple[Field, NDArray[np.uint8]]:
+def _transferred(rng: Generator, scene: Field, label: NDArray[np.uint8], frames: Frames) -> Scene:
     """Tools of a real frame cut out and put over the scene, in another light."""
     image, tools = _cropped(rng, _any(rng, frames))
     if not (tools == 1).any():
@@ -149,9 +147,7 @@ def _transferred(
     return _placed(rng, scene, label, canvas, blurred=False)
 
 
-def _placed(
-    rng: Generator, scene: Field, label: NDArray[np.uint8], canvas: Canvas, blurred: bool = True
-) -> tuple[Field, NDArray[np.uint8]]:
+def _placed(rng: Generator, scene: Field, label: NDArray[np.uint8], canvas: Canvas, blurred: bool = True) -> Scene:
     """The painted body over the scene: behind tissue in places, with its shadow, blurred by focus and motion."""
     covered, outline, color = canvas.covered, canvas.outline, canvas.color
     if rng.random() < 0.12:  # tissue in front of a part of it

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +14,14 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 from torch.nn import functional
+from torch.nn.utils import clip_grad_norm_, convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from endoprior.system.atomic import whole_file
 from endoprior.system.surroundings import without_current_folder
 from endoprior.tool_masks.network import MULTIPLE, ToolNetwork, network_input
 
-from .composites import IGNORED, LabeledFrame, examples
+from .composites import IGNORED, Frames, examples
 
 SCENES, PHOTOGRAPHS = 8, 2
 """Scenes in a batch, and how often each is photographed: painting takes longer than training."""
@@ -41,7 +42,7 @@ REGION = 0.5
 class Examples(Dataset):
     """Scene number i of a seed is always the same."""
 
-    def __init__(self, frames: Sequence[Sequence[LabeledFrame]], seed: int, number: int) -> None:
+    def __init__(self, frames: Frames, seed: int, number: int) -> None:
         self._frames, self._seed, self._number = frames, seed, number
 
     def __len__(self) -> int:
@@ -69,14 +70,14 @@ def loss_of(log_odds: Tensor, label: Tensor) -> Tensor:
 
 
 def fit(
-    frames: Sequence[Sequence[LabeledFrame]],
+    frames: Frames,
     steps: int,
     seed: int = 0,
     *,
     start: ToolNetwork | None = None,
     checkpoint: Path | None = None,
     workers: int = 1,
-    report: Callable[[int, float], None] = lambda step, loss: None,
+    report: Callable[[int, float], None] = lambda _step, _loss: None,
 ) -> ToolNetwork:
     """Train a network; returns its averaged weights.
 
@@ -128,12 +129,11 @@ def _step(state: _State, image: Tensor, label: Tensor, rate: float) -> float:
     state.network.train()
     with torch.autocast("cpu", torch.bfloat16):
         *coarse, fine = state.network.levels(image.contiguous(memory_format=torch.channels_last))
-    loss = loss_of(fine[:, 0].float(), label) + COARSE * sum(
-        _coarse_loss(level[:, 0].float(), label) for level in coarse
-    )
+    loss = loss_of(fine[:, 0].float(), label)
+    loss = loss + COARSE * sum(_coarse_loss(level[:, 0].float(), label) for level in coarse)
     state.optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    torch.nn.utils.clip_grad_norm_(state.network.parameters(), 1.0)
+    clip_grad_norm_(state.network.parameters(), 1.0)
     state.optimizer.step()
     state.step += 1
     keep = min(AVERAGED, state.step / (state.step + 9))
@@ -163,7 +163,8 @@ class _State:
 
     @staticmethod
     def new(start: ToolNetwork | None) -> _State:
-        network = ToolNetwork().to(memory_format=torch.channels_last)
+        network = ToolNetwork()
+        convert_conv2d_weight_memory_format(network, torch.channels_last)
         if start is not None:
             network.load_state_dict(start.state_dict())
         optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)

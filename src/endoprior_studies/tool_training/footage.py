@@ -1,12 +1,16 @@
-"""Real frames with labels, by the hospital, scope and instruments that they come from.
+"""Frames with labels: real ones, by the hospital, scope and instruments that they come from, and those of phantoms.
 
 `ENDOPRIOR_DATA` holds the clips: `bowel_lift` (masks), `vocalfolds` (labels by hand), `mono_endo.mp4` (a part without
 tools), `wild` (clips without tools). What is trained for one set has not seen that set; `wild` is never trained on.
+
+Phantoms have a family of instruments over two kinds of tissue each, with exact masks. They are rendered in three
+dimensions and share nothing with the painted instruments of the training, so all of it is new to the network.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -17,6 +21,7 @@ from numpy.typing import NDArray
 from endoprior.data.images import decode_image, read_color, read_tool_mask
 from endoprior.data.video_files import open_container
 from endoprior.footage.border import find_outline
+from endoprior.phantom import PhantomConfig, write_phantom
 
 from .benchmark import TestFrame
 from .composites import IGNORED, LabeledFrame
@@ -29,6 +34,9 @@ DARK, DARK_PX = 25, 25
 """Largest level and least width of what is black around a round image."""
 WILD = ("colon_polyp", "colon_boxes", "fetoscopy", "broncho_phantom")
 """Clips without a tool."""
+FAMILIES = ("gray_blue", "black", "white_plastic", "steel", "gold", "green", "blue", "mixed")
+TISSUES = ("bowel", "pale", "fat", "purple", "liver", "warm", "smoke", "blood")
+"""Of the phantoms."""
 WILD_FRAMES = 12
 """Of each of them."""
 Labeled = tuple[str, NDArray[np.uint8], NDArray[np.uint8]]
@@ -71,7 +79,7 @@ def _without_tools(path: Path, wanted: range) -> Iterator[Labeled]:
     with open_container(path) as container:
         for i, picture in enumerate(container.decode(video=0)):
             if i in wanted:
-                image = picture.to_ndarray(format="rgb24")
+                image = np.asarray(picture.to_ndarray(format="rgb24"), np.uint8)
                 kernel = np.ones((DARK_PX, DARK_PX), np.uint8)
                 dark = cv2.morphologyEx((image.max(-1) < DARK).astype(np.uint8), cv2.MORPH_OPEN, kernel)
                 yield f"{path.stem} {i}", image, np.where(dark > 0, IGNORED, 0).astype(np.uint8)
@@ -105,6 +113,29 @@ def test_frames(root: Path, name: str) -> Iterator[TestFrame]:
 def _for_training(rgb_u8: NDArray[np.uint8], label: NDArray[np.uint8]) -> LabeledFrame:
     scale = LONG_SIDE_PX / max(label.shape)
     size = (round(label.shape[1] * scale), round(label.shape[0] * scale))
-    return LabeledFrame(
-        cv2.resize(rgb_u8, size, interpolation=cv2.INTER_AREA), cv2.resize(label, size, interpolation=cv2.INTER_NEAREST)
-    )
+    ways = ((rgb_u8, cv2.INTER_AREA), (label, cv2.INTER_NEAREST))
+    return LabeledFrame(*(np.asarray(cv2.resize(each, size, interpolation=way), np.uint8) for each, way in ways))
+
+
+def phantom_sets() -> dict[str, tuple[PhantomConfig, ...]]:
+    """The phantoms of each line of the table: two for each family; every tissue occurs twice."""
+    plain = PhantomConfig(frames=6, width=320, height=256, side_views=False)
+    return {
+        f"phantom: {family}": tuple(
+            replace(plain, seed=i, instruments=family, tissue=TISSUES[(i + shift) % len(TISSUES)]) for shift in (0, 3)
+        )
+        for i, family in enumerate(FAMILIES)
+    }
+
+
+def phantom_frames(folder: Path, phantoms: tuple[PhantomConfig, ...]) -> Iterator[TestFrame]:
+    """The frames of some phantoms; written to `folder` once."""
+    for config in phantoms:
+        place = folder / f"{config.instruments}_{config.tissue}"
+        if not place.exists():
+            write_phantom(place, config)
+        for i in range(config.frames):
+            tools = read_tool_mask(place / "masks" / f"{i:06d}.png")
+            whole = np.ones_like(tools)
+            image = read_color(place / "images" / f"{i:06d}.png")
+            yield TestFrame(f"{config.instruments} on {config.tissue} {i}", image, whole, tools, whole)

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from .materials import coated, colored, steel
 from .noise import Field, fractal_field, log_uniform, smooth_field
-from .parts import Canvas, Part, canvas_over, paint
+from .parts import Canvas, Part, canvas_over, coated, colored, paint, steel
 
 
 def gauze(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas:
@@ -117,7 +116,7 @@ def needle(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas:
         (int(x), int(y)), (int(radius), int(radius * rng.uniform(0.4, 1))), 0, 0, int(rng.uniform(90, 200)), 4
     )
     turn = np.deg2rad(first)
-    points = (arc - (x, y)) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + (x, y)
+    points = (np.array(arc) - (x, y)) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + (x, y)
     _line(canvas, points, rng.uniform(1.5, 4), np.full(3, rng.uniform(0.4, 1), np.float32), rng)
     tone = rng.choice([0, 1, 2])
     color = (np.array([0.35, 0.15, 0.55]), np.full(3, rng.uniform(0.02, 0.2)), np.array([0.2, 0.4, 0.75]))[tone]

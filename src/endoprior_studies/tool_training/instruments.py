@@ -14,9 +14,20 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from .materials import Material, coated, colored, shaft_material, steel, tip_material
 from .noise import Field, log_uniform, smooth_field
-from .parts import Canvas, Part, Point, canvas_over, paint
+from .parts import (
+    Canvas,
+    Material,
+    Part,
+    Point,
+    canvas_over,
+    coated,
+    colored,
+    paint,
+    shaft_material,
+    steel,
+    tip_material,
+)
 
 WIDTH_PX = (5.0, 60.0)
 """Width of a shaft, even in its logarithm."""
@@ -33,9 +44,9 @@ def instrument(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas
     tip = _TIPS[rng.choice(len(_TIPS), p=_OFTEN)]
     reach = rng.uniform(*REACH) * float(np.hypot(h, w))
     shaft, end, along = _shaft(rng, start, along, width, reach)
-    for part in (
-        (*tip(rng, end, along, width), *shaft) if rng.random() < 0.5 else (*shaft, *tip(rng, end, along, width))
-    ):
+    tip_is_behind = rng.random() < 0.5
+    tips = tip(rng, end, along, width)
+    for part in (*tips, *shaft) if tip_is_behind else (*shaft, *tips):
         paint(rng, canvas, part)
     return canvas
 

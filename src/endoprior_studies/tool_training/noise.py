@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.random import Generator
-from numpy.typing import NDArray
 
-Field = NDArray[np.float32]
+Field = MatLike
+"""An array of floats as OpenCV takes and gives it: float32, but for sums with wider numbers on the way."""
 
 
 def smooth_field(rng: Generator, size: tuple[int, int], spot_px: float) -> Field:
@@ -38,7 +39,7 @@ def _enlarged(rng: Generator, cells: Field, size: tuple[int, int], spot_px: floa
         cells, spot_px = cv2.resize(cells, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC), spot_px / 4
     spot_px = max(spot_px, h / (cells.shape[0] - 1), w / (cells.shape[1] - 1))
     y, x = (rng.uniform(0, m - 1 - n / spot_px) for n, m in zip(size, cells.shape, strict=True))
-    shift = np.float32([[1 / spot_px, 0, x], [0, 1 / spot_px, y]])
+    shift = np.array([[1 / spot_px, 0, x], [0, 1 / spot_px, y]], np.float32)
     return cv2.warpAffine(
         cells, shift, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
     )
@@ -49,17 +50,14 @@ def ridges(field: Field, width: float) -> Field:
     return np.clip(1 - np.abs(field) / np.float32(width), 0, 1)
 
 
-def random_curve(rng: Generator, knots: int, at: Field, smooth: bool = True) -> Field:
-    """Values in [0, 1] at the positions `at` (any shape, in [0, 1]) of a random curve through `knots` values."""
-    values = rng.uniform(0, 1, knots)
+def random_curve(rng: Generator, knots: int, at: Field) -> Field:
+    """Values in [0, 1] at the positions `at` (any shape, in [0, 1]) of a smooth random curve through `knots` values."""
+    values = rng.uniform(0, 1, knots).astype(np.float32)
     position = np.clip(at, 0, 1) * (knots - 1)
-    if smooth:
-        left = np.minimum(position.astype(np.int32), knots - 2)
-        t = position - left
-        t = t * t * (3 - 2 * t)
-        values = values.astype(np.float32)
-        return values[left] * (1 - t) + values[left + 1] * t
-    return np.interp(position, np.arange(knots), values).astype(np.float32)
+    left = np.minimum(position.astype(np.int32), knots - 2)
+    t = position - left
+    t = t * t * (3 - 2 * t)
+    return values[left] * (1 - t) + values[left + 1] * t
 
 
 def log_uniform(rng: Generator, low: float, high: float) -> float:

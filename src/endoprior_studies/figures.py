@@ -1,10 +1,11 @@
-"""Figures of images side by side: frames with zooms, views from the sides, depth instability, prior and density.
+"""Figures: plots of scores, and images side by side (frames with zooms, sides, depth instability, prior and density).
 
-`H, W` image size. All show the first seed and fold at the last budget.
+`H, W` image size. Images show the first seed and fold at the last budget.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -12,21 +13,31 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from endoprior.core.config import DataConfig
 from endoprior.core.geometry import length_unit, project
-from endoprior.core.types import Camera, Frame, RenderOutput
+from endoprior.core.types import Camera, Frame, RenderedView
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.model.scene import Scene
+from endoprior.evaluation.registry import all_scores
+from endoprior.model.scene import RenderedScene, Scene
 from endoprior.model.scene_file import load_scene
 from endoprior.priors import joint_texture_prior, specular_likelihood
+from endoprior.system.atomic import whole_file
 from endoprior.visualization.camera_paths import tissue_distance, turned
 from endoprior.visualization.image_tools import colorize, label, tile, to_u8, write_png
 
-from .matrix import Matrix
+from .matrix import Matrix, frames_of
+from .results import Results
 from .spec import Cell
 
+FLOW_SCORES = ("flow_error", "flow_error_raft_small", "flow_error_dis")
+"""The figure shows the first of these that all methods have."""
+CURVE_SCORE = "psnr_tissue"
 ZOOM = 4
 """A zoom window is this fraction of the frame's width and height."""
 DENSITY_SIGMA = 64
@@ -39,7 +50,76 @@ INSTABILITY_FULL_SCALE_MM = 1.0
 DIFFERENCE_FULL_SCALE_MM = 0.5
 
 
-def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
+def budget_figure(results: Results, path: Path) -> None:
+    """Number of Gaussians against flow error: one line through the budgets of each method."""
+    spec = results.spec
+
+    def plot(axis: Axes, sequence: str) -> None:
+        score = _flow_score(results, sequence)
+        for method in spec.methods:
+            budgets = spec.budgets or (None,)
+            counts = [results.summary(sequence, b, method, "num_gaussians") for b in budgets]
+            errors = [results.summary(sequence, b, method, score) for b in budgets]
+            axis.errorbar(
+                [c.mean for c in counts],
+                [e.mean for e in errors],
+                yerr=[e.std if math.isfinite(e.std) else 0 for e in errors],
+                marker="o",
+                capsize=2,
+                label=spec.label(method),
+            )
+        axis.set_xlabel("Gaussians")
+        axis.set_ylabel(all_scores()[score].heading())
+
+    _panels(list(spec.sequences), plot, path)
+
+
+def curve_figure(results: Results, matrix: Matrix, path: Path) -> None:
+    """Tissue PSNR of each held-out frame, mean over seeds: one line for each method, at its last budget."""
+    spec = results.spec
+    budget = spec.budgets[-1] if spec.budgets else None
+
+    def plot(axis: Axes, sequence: str) -> None:
+        for method in spec.methods:
+            curves = []
+            for seed in spec.seeds:  # every fold has held-out frames of its own
+                cells = [Cell(sequence, method, budget, seed, fold) for fold in spec.folds(sequence, method)]
+                folders = [matrix.done[cell] for cell in cells if cell in matrix.done]
+                curves.append({i: v for folder in folders for i, v in frames_of(folder).get(CURVE_SCORE, {}).items()})
+            known = [curve for curve in curves if curve]
+            if known:
+                frames = sorted(set.intersection(*(set(curve) for curve in known)))
+                means = [float(np.mean([curve[i] for curve in known])) for i in frames]
+                axis.plot(frames, means, marker=".", label=spec.label(method))
+        axis.set_xlabel("frame")
+        axis.set_ylabel(all_scores()[CURVE_SCORE].heading())
+
+    _panels(list(spec.sequences), plot, path)
+
+
+def _flow_score(results: Results, sequence: str) -> str:
+    cells = [cell for cell in results.scores if cell.sequence == sequence]
+    return next((s for s in FLOW_SCORES if cells and all(s in results.scores[c] for c in cells)), FLOW_SCORES[-1])
+
+
+def _panels(sequences: list[str], plot: Callable[[Axes, str], None], path: Path) -> None:
+    """One panel for each sequence, side by side, with one legend."""
+    # An own canvas: `pyplot` would choose a backend for the whole process.
+    figure = Figure(figsize=(5 * len(sequences), 3.8), layout="constrained", dpi=120)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(sequences), squeeze=False)[0]
+    for axis, sequence in zip(axes, sequences, strict=True):
+        plot(axis, sequence)
+        axis.set_title(sequence, fontsize=10)
+        axis.grid(alpha=0.3)
+    handles, labels = axes[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5), fontsize=8)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
+
+
+def scenes_of(matrix: Matrix, sequence: str) -> dict[str, RenderedScene]:
     """The trained scene of every method that has one and whose cell is finished, by label."""
     spec = matrix.spec
     budget = spec.budgets[-1] if spec.budgets else None
@@ -49,16 +129,16 @@ def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
     return {spec.label(m): load_scene(run) for m, run in runs.items() if (run / "scene.safetensors").exists()}
 
 
-def _camera(scene: Scene, frame: Frame) -> Camera:
+def _camera(scene: RenderedScene, frame: Frame) -> Camera:
     """The camera of a frame, where the scene has it: its poses may have been estimated."""
     return replace(frame.camera, world_to_camera=scene.cameras[frame.index].world_to_camera)
 
 
-def _rendered(scene: Scene, frame: Frame) -> RenderOutput:
+def _rendered(scene: RenderedScene, frame: Frame) -> RenderedView:
     return scene.render(frame.time, _camera(scene, frame))
 
 
-def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def frames_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """The middle test frame, zoomed to a highlight, a dark part and a mask border; columns: input and each method."""
     test = sequence.frames("test")
     frame = test[len(test) // 2]
@@ -74,7 +154,7 @@ def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np
     return tile(tiles, len(columns))
 
 
-def sides_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def sides_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """The middle test frame, turned about the tissue; a row for each angle, a column for each method."""
     test = sequence.frames("test")
     frame, tiles = test[len(test) // 2], []
@@ -115,7 +195,7 @@ def _outlined(image: NDArray[np.uint8], windows: dict[str, tuple[slice, slice]])
     return outlined
 
 
-def instability_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def instability_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """Mean absolute change of rendered depth between adjacent frames, and each method's minus the first's."""
     frames, unit = list(sequence.frames("video")), length_unit(sequence.depth_is_relative)
     maps = {name: instability_map(scene, frames) for name, scene in scenes.items()}
@@ -132,7 +212,7 @@ def instability_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArr
     return tile(top + bottom, len(maps))
 
 
-def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
+def instability_map(scene: RenderedScene, frames: list[Frame]) -> NDArray[np.float64]:
     """(H, W) mean |change of depth|, mm, over adjacent pairs that both show rendered tissue; NaN where none does."""
     total = np.zeros(frames[0].tissue_mask.shape)
     count = np.zeros_like(total)
@@ -144,11 +224,11 @@ def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def prior_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def prior_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDArray[np.uint8]:
     """The joint texture prior of the first frame, and the density of each method's projected centers there."""
     frame = sequence.frame(0)
     rho = joint_texture_prior(frame.rgb, frame.tissue_mask)
-    densities = {name: center_density(scene, frame) for name, scene in scenes.items()}
+    densities = {name: center_density(scene, frame) for name, scene in scenes.items() if isinstance(scene, Scene)}
     top = max(float(np.percentile(density, 99.5)) for density in densities.values())
     tiles = [_labeled(frame.rgb_u8, "input"), _labeled(colorize(rho, 0, 1), "prior")]
     tiles += [_labeled(colorize(d, 0, top), f"centers, {name}") for name, d in densities.items()]
@@ -163,15 +243,16 @@ def center_density(scene: Scene, frame: Frame) -> NDArray[np.float32]:
     column, row = pixels[seen].astype(int).T
     counts = np.zeros((height, width), np.float32)
     np.add.at(counts, (row, column), 1)
-    return cv2.GaussianBlur(counts, (0, 0), max(width / DENSITY_SIGMA, 1))
+    return np.asarray(cv2.GaussianBlur(counts, (0, 0), max(width / DENSITY_SIGMA, 1)), np.float32)
 
 
-def _labeled(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+def _labeled(image: MatLike, text: str) -> NDArray[np.uint8]:
     factor = -(-TILE_WIDTH_PX // image.shape[1])
-    return label(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST), text)
+    large = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    return label(np.asarray(large, np.uint8), text)
 
 
-GRIDS: dict[str, Callable[[FrameSequence, dict[str, Scene]], NDArray[np.uint8]]] = {
+GRIDS: dict[str, Callable[[FrameSequence, dict[str, RenderedScene]], NDArray[np.uint8]]] = {
     "frames": frames_grid,
     "sides": sides_grid,
     "instability": instability_grid,
