@@ -112,6 +112,22 @@ def test_a_rigid_motion_changes_no_distance():
     assert same.grad.isfinite().all(), "points that coincide"
 
 
+def test_threads_do_not_change_the_order_of_sums():
+    rng = torch.Generator().manual_seed(0)
+    neighbors = torch.randint(0, 6000, (6000, 5), generator=rng)
+    before, after = torch.randn(2, 6000, 6, generator=rng)
+    gradients, threads = [], torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        for _ in range(20):
+            moved = after.clone().requires_grad_()
+            (distance_change(before, moved, neighbors) * 1e3).backward()
+            gradients.append(moved.grad)
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(gradients[0], each) for each in gradients)
+
+
 def test_neighbor_terms_by_hand():
     gaussians = gaussians_at([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10], [10, 10, 0]])
     offsets = METHOD.motion(CFG).offsets(gaussians, network(), 0.2, CFG, NUMBA.model)

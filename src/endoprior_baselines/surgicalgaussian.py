@@ -238,8 +238,13 @@ def _by_opencv(values: Tensor) -> Tensor:
 
 def distance_change(before: Tensor, after: Tensor, neighbors: Tensor) -> Tensor:
     """Mean absolute change of the distance between each of N vectors (N, D) and its neighbors (N, K), ()."""
-    lengths = [((values[:, None] - values[neighbors]) ** 2).sum(-1).add(TINY).sqrt() for values in (before, after)]
-    return (lengths[0] - lengths[1]).abs().mean()
+
+    def lengths(values: Tensor) -> Tensor:
+        # The gradient of `values[neighbors]` would be summed by several threads in any order.
+        others = values.index_select(0, neighbors.flatten()).view(*neighbors.shape, -1)
+        return ((values[:, None] - others) ** 2).sum(-1).add(TINY).sqrt()
+
+    return (lengths(before) - lengths(after)).abs().mean()
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
