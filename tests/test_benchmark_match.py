@@ -107,6 +107,7 @@ def test_bad_matches_are_named(tmp_path, match, said):
     assert said in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_benchmark_trains_with_what_it_finds(tmp_path):
     events = {"density.start_iteration": 2, "density.every": 2}
     planes = {"deformation.hexplane.channels": 8, "deformation.hexplane.multires": [1]}

@@ -103,6 +103,7 @@ def finished(tmp_path_factory):
     return matrix, trained, said, (before, contents(folder / "clip"))
 
 
+@pytest.mark.slow
 def test_training_gets_the_estimated_path_and_the_sequence_is_only_read(finished):
     matrix, trained, said, (before, after) = finished
     assert before == after and len(trained) == 3

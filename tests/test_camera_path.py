@@ -160,6 +160,7 @@ def test_back_projection_inverts_projection():
     assert np.allclose(seen[:, :2] / seen[:, 2:] * MATRIX[0, 0] + OPENCV[:2, 2], [[10, 20], [100, 70]])
 
 
+@pytest.mark.slow
 def test_the_better_path_is_taken(relief, monkeypatch):
     frames, _ = relief
     args = frames.__getitem__, 24, lens(), SIZE
@@ -189,6 +190,7 @@ def test_colmap_finds_the_path():
     assert drift(found.camera_to_world, true) < 2.0
 
 
+@pytest.mark.slow
 def test_breathing_is_not_given_to_the_camera():
     true = path(60, 0.3)
     swell = [np.array([1.5 * np.sin(2 * np.pi * i / 15), 1.0 * np.cos(2 * np.pi * i / 15)]) for i in range(60)]

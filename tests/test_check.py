@@ -53,6 +53,7 @@ def data(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "data", ignore=shutil.ignore_patterns("right")))
 
 
+@pytest.mark.slow
 def test_frames_of_uncertain_masks_are_named_and_shown(data, tmp_path, monkeypatch):
     confidence = [0.9, 0.4, 0.8, 0.3] + [0.45 + 0.001 * i for i in range(5)] + [0.9] * 3
     write_rows(data, [FrameRow(i, 0.1, value) for i, value in enumerate(confidence)])

@@ -112,6 +112,7 @@ def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
     assert not names & set(evaluate(train(plain, cfg), plain, networks=False).scores)
 
 
+@pytest.mark.slow
 def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
     """The demo's path at a small size; its full size is `make demo`."""
     from endoprior import phantom as package

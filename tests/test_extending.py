@@ -106,6 +106,7 @@ def tiny_scene(folder: Path) -> Scene:
     return SingleScene(gaussians, None, cfg, cameras, 15.0, torch.zeros(20), torch.zeros(20))
 
 
+@pytest.mark.slow
 def test_a_new_score_is_computed_and_stands_in_tables(extend, tmp_path, make_tiny_sequence):
     extend("scores.md", "evaluation/scorers/mae.py", "evaluation/registry.py", "SCORERS")
     data = make_tiny_sequence(num_frames=3)

@@ -179,6 +179,7 @@ def test_wrong_folds_are_named(tmp_path, folds):
         load_spec(tmp_path / "spec.yaml")
 
 
+@pytest.mark.slow
 def test_a_benchmark_of_folds(tmp_path):
     """A preset, a method of another package and images, each of the frames of its fold; cells of fold 0 stay."""
     data = write_tiny_sequence(tmp_path / "tiny")

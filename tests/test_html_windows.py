@@ -137,6 +137,7 @@ def same_as_rendered(page: Page, scene: WindowedScene, frame: int) -> None:
     assert got.shape == want.shape and error.mean() < 0.65 and want.std() > 20  # as in test_html_player.py
 
 
+@pytest.mark.slow
 def test_draws_what_the_renderer_draws_on_both_sides_of_a_border(scene, page):
     # In a window, in an overlap, after it; two windows on; back by one step, and far.
     for frame in (0, 5, 7, 19, 14, 3):

@@ -246,6 +246,7 @@ def test_relief_and_shape_stay_on_the_tissue_when_the_camera_rolls(standing, mon
 # --- the written folder ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_poses_are_written_twice_and_read(rigid):
     poses = np.load(rigid / "truth/camera_to_world.npy")
     assert poses.shape == (20, 4, 4) and poses.dtype == np.float64

@@ -92,6 +92,7 @@ def test_squeezed_eyes(tmp_path, capsys, size):
     assert "--squeezed-eyes: expected both cameras" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_row_offset_is_measured_and_undone(tmp_path, capsys):
     video, calibrated = side_by_side(tmp_path / "v.mkv", low=5), calibration(tmp_path / "c.json", width=320, height=256)
     assert prepare(tmp_path, video, calibrated, "--keep-right") == 0

@@ -47,6 +47,7 @@ def test_the_product_trains_and_scores_by_itself(alone, tiny_sequence, tmp_path)
     assert alone("eval", tmp_path / "run", "--no-networks").returncode == 0
 
 
+@pytest.mark.slow
 def test_what_is_not_installed_is_not_offered(alone, tiny_sequence, tmp_path):
     assert "bench" not in alone("--help").stdout
     done = alone("train", tiny_sequence, tmp_path / "run", "--preset", "endogs")

@@ -64,6 +64,7 @@ def stored_depth(depth, scale):
     return np.where(is_measured(units), units, 0).astype(np.float64) * scale
 
 
+@pytest.mark.slow
 @examples(25)
 @given(recordings())
 def test_what_was_written_is_read(made):
@@ -107,6 +108,7 @@ def test_polarity_stride_and_shrink_change_what_they_say(made, stride, shrink):
                 assert np.array_equal(frame.tissue_mask, tool) and np.array_equal(frame.rgb_u8, rgb)
 
 
+@pytest.mark.slow
 @examples(15)
 @given(recordings())
 def test_exactly_the_unusable_is_rejected(made):
@@ -130,6 +132,7 @@ def test_exactly_the_unusable_is_rejected(made):
         assert f"expected {expected}, got " in str(refusal.value) and "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 @examples(25)
 @given(recordings(), st.floats(0, 100), st.floats(0, 100), st.booleans())
 def test_cleaned_depth_stays_within_what_was_measured(made, one, other, lift):

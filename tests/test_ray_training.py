@@ -34,6 +34,7 @@ def write_config(file: Path, cfg: Config) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_windows_trained_elsewhere_in_any_order_give_the_same_bits(make_tiny_sequence, tmp_path):
     data, cfg, whole, out = make_tiny_sequence(num_frames=20), in_windows(14), tmp_path / "whole", tmp_path / "run"
     train(load_sequence(data, cfg.data), cfg, whole)

@@ -132,6 +132,7 @@ def raw_sequence(folder, frames=9):
     )[0]
 
 
+@pytest.mark.slow
 def test_a_raw_sequence_lands_on_itself(tmp_path, capsys):
     """The printed command as it is: masks of every second frame, poses in m, turned by the rectification."""
     poses, turn = raw_sequence(tmp_path / "P1")

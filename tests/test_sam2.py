@@ -51,6 +51,7 @@ def masks_of(folder):
     return [read_tool_mask(file) for file in sorted((folder / "masks").glob("*.png"))]
 
 
+@pytest.mark.slow
 @needs_transformers
 def test_a_model_folder_follows_objects_in_both_directions(model, monkeypatch):
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
@@ -148,6 +149,7 @@ def video(phantom, folder):
 OPTIONS = PrepareConfig(masks="sam2", depth="shading", poses="still", border="keep")
 
 
+@pytest.mark.slow
 def test_prepare_writes_the_segmenters_masks_and_depth_made_with_them(phantom, tmp_path, segmenter):
     done = prepare(video(phantom, tmp_path), tmp_path / "out", OPTIONS)
     masks = masks_of(done.out)
@@ -169,6 +171,7 @@ def test_prepare_writes_the_segmenters_masks_and_depth_made_with_them(phantom, t
     assert max(near) < max(far), "nearer to depth made with these masks than with our own"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop_at", ["following tools, round 1", "following the camera", "writing frames"])
 def test_prepare_resumes_after_an_interruption(phantom, tmp_path, segmenter, stop_at):
     source = video(phantom, tmp_path)

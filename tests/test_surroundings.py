@@ -43,6 +43,7 @@ def endoprior(*words: object) -> list[str]:
 # Code in the current folder.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [python_command("endoprior", "plugins"), endoprior("plugins")])
 def test_a_module_in_the_current_folder_is_not_imported(words, tmp_path):
     (tmp_path / "json.py").write_text(LEAVES_A_MARK)
@@ -122,6 +123,7 @@ def test_a_training_goes_on_though_its_streams_are_closed(redirection, tiny_sequ
     assert (tmp_path / "run" / "metrics.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
 def test_a_full_disk_behind_stdout_is_named(tmp_path):
     done = start(python_command("endoprior", "plugins"), tmp_path, ">/dev/full")
@@ -152,6 +154,7 @@ def test_a_user_without_a_home_is_told_to_name_one(monkeypatch, capsys):
     assert main(["plugins"]) == 2 and "HOME: expected an absolute path" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_deleted_working_folder_is_named(tmp_path, monkeypatch, capsys):
     gone = tmp_path / "gone"
     gone.mkdir()

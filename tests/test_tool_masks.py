@@ -52,6 +52,7 @@ def overlap(found, true):
     return (found & true).sum() / (found | true).sum()
 
 
+@pytest.mark.slow
 def test_tools_of_the_phantom_are_found(phantom):
     images, true, _ = phantom
     found = [ToolFinder().find(image, whole(image)) for image in images]

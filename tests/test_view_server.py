@@ -95,6 +95,7 @@ def test_the_slider_changes_the_image(viewer, client, scene):
     assert np.array_equal(canvas[2:50], expected) and not canvas[0].any()
 
 
+@pytest.mark.slow
 def test_every_layer_is_a_different_image(viewer, client):
     client.set(viewer.panel.frame, 4)
     images = {"color": client.image()}
