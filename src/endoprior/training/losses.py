@@ -227,7 +227,10 @@ class _SupervisedLosses(torch.autograd.Function):
     def backward(ctx: Any, v_terms: Tensor) -> tuple:
         # Gradients of the four terms are already added up: valid only if all are summed with weight one.
         if not bool((v_terms == 1).all()):
-            raise ValueError("the terms of supervised_losses must be added, not scaled; pass `weights` instead")
+            raise ValueError(
+                "expected the terms color, depth, tv and edges as they are; got one that is scaled or left out: their "
+                "gradients are added already. Set their weights in config.loss."
+            )
         return *ctx.grads, None, None, None, None, None, None
 
 

@@ -8,6 +8,7 @@ must be in memory at once.
 from __future__ import annotations
 
 import math
+from operator import attrgetter
 
 import numpy as np
 
@@ -29,10 +30,13 @@ def reject_ignored_options(cfg: Config) -> None:
         only |= {} if method.uses_prior else {"temporal.weight": 0.0}  # the term weighs Gaussians by the prior
         only |= {} if method.starts_from_flow else {"init.motion": "rest"}
     for name, value in only.items():
-        section, _, field = name.partition(".")
-        got = getattr(getattr(cfg, section), field)
+        got = attrgetter(name)(cfg)
         if got != value:
-            fix = f"Start from --preset {cfg.method}, without --{name.replace('_', '-')}."
+            if cfg.method in preset_names() and attrgetter(name)(preset(cfg.method)) == value:
+                fix = f"Start from --preset {cfg.method}, without --{name.replace('_', '-')}."
+            else:  # its author is asking, whose preset has it
+                own = ", or derive the method from endoprior.training.own_method.OwnMethod"
+                fix = f"Set {name} to {value} in the code of its preset{own if name == 'init.motion' else ''}."
             raise input_error(name, f"{value} with method {cfg.method}, which does not use it", str(got), fix)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..core.checks import input_error
 from ..core.config import Config
 from ..core.types import Camera, RenderOutput, Splats
 from ..model.gaussians import Gaussians
@@ -191,6 +192,7 @@ class TrainingStep:
         """Weighted terms, () each; and the mean absolute color error over tissue, (), that the check watches."""
         cfg, frame = self.cfg, drawn.frame
         terms = self.method.terms(drawn, cfg, self.ops)  # ours: `losses.supervised_terms`
+        _check_terms(terms, cfg)
         is_error = self.method.color_is_error
         error = terms["color"] if is_error else color_l1(drawn.out.color.detach(), frame.rgb, frame.tissue_mask)
         if drawn.offsets is not None and state.tracks is not None:
@@ -228,6 +230,18 @@ class TrainingStep:
         state.stats, parents = density.apply_plan(state.optimizer, planned, state.stats, rng)
         state.tracks = state.tracks and state.tracks.inherited(parents)
         return planned.counts()
+
+
+def _check_terms(terms: dict[str, Tensor], cfg: Config) -> None:
+    """Raise InputError unless a method's terms are tensors (), with other names than those that training adds."""
+    added = {"track"} if cfg.loss.track_weight and cfg.init.motion == "flow" else set()
+    added |= {"displacement", "distance"} if cfg.temporal.weight else set()
+    for name, term in terms.items():
+        if not isinstance(term, Tensor) or term.ndim:
+            got = f"shape {tuple(term.shape)}" if isinstance(term, Tensor) else f"a {type(term).__name__}"
+            raise input_error(f"loss term {name}", "a tensor of shape ()", got, "Return its mean or its sum.")
+        if name in added:
+            raise input_error(f"loss term {name}", "a name of its own", "that of a built-in term", "Rename it.")
 
 
 def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
