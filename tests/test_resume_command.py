@@ -139,8 +139,8 @@ def test_bad_config_files(tmp_path, name, text, says):
     assert str(caught.value).startswith(f"{tmp_path / name}: ") and says in str(caught.value)
 
 
-def extended(run: Path, to: Path, total: int, stop_at: int = 0) -> Path:
-    """A copy of the run, extended to so many iterations; killed before fine iteration `stop_at` if it is given."""
+def extended(run: Path, to: Path, total: int, stop_at: int = 0, seconds: float = 60) -> Path:
+    """A copy of the run, extended to so many iterations; killed after fine iteration `stop_at` if it is given."""
     out = Path(shutil.copytree(run, to))
     if not stop_at:
         assert main(["train", "--resume", str(out), "--iterations", str(total), "--no-networks"]) == 0
@@ -153,12 +153,13 @@ def extended(run: Path, to: Path, total: int, stop_at: int = 0) -> Path:
     cfg = config_of_run(out).extended(total)
     sequence = endoprior.load_sequence(sequence_of_run(out), cfg.data)
     with pytest.raises(RuntimeError, match="killed"):
-        start_run(sequence, cfg, out, resume=True, extends=True, say=lambda text: None).complete(kill)
+        run_on = start_run(sequence, cfg, out, resume=True, extends=True, say=lambda text: None)
+        run_on.complete(kill, checkpoint_seconds=seconds)
     return out
 
 
-@pytest.mark.parametrize("stop_at", [13, 16])  # a kill leaves the checkpoint from before the extension
-def test_a_finished_run_is_extended_and_a_killed_extension_resumes(interrupted, tmp_path, stop_at):
+@pytest.mark.parametrize("seconds", [0, 60])  # 60: a kill leaves the checkpoint from before the extension
+def test_a_finished_run_is_extended_and_a_killed_extension_resumes(interrupted, tmp_path, seconds):
     whole = interrupted[2].parent
     before = config_of_run(whole)
     assert (whole / "metrics.json").is_file()
@@ -171,7 +172,7 @@ def test_a_finished_run_is_extended_and_a_killed_extension_resumes(interrupted, 
     scene = (once / "scene.safetensors").read_bytes()
     assert scene != (whole / "scene.safetensors").read_bytes()
 
-    killed = extended(whole, tmp_path / "killed", 20, stop_at)
+    killed = extended(whole, tmp_path / "killed", 20, stop_at=16, seconds=seconds)
     assert config_of_run(killed) == cfg
     assert not [name for name in ("scene.safetensors", "metrics.json") if (killed / name).exists()]
     assert main(["train", "--resume", str(killed), "--no-networks"]) == 0
