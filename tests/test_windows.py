@@ -29,7 +29,8 @@ from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file
-from endoprior.runs.train import start_run, train
+from endoprior.runs.remote import train_here, trainings
+from endoprior.runs.train import WindowedRun, start_run, train
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
@@ -367,6 +368,24 @@ def test_every_window_is_extended(trained, tmp_path, killed_after):
     assert (last["window"], last["iteration"]) == (2, 20)
     with pytest.raises(InputError, match="more than the 30 of 30 iterations"):
         start_run(sequence, cfg, once, resume=True, extends=True, say=lambda text: None)
+
+
+def test_another_process_extends_every_window(trained, tmp_path):
+    data, run = trained
+    cfg, sequence = in_windows(tiny_config("basis")).extended(30), load_sequence(data)
+    once, parts = (Path(shutil.copytree(run, tmp_path / name)) for name in ("once", "parts"))
+    here, elsewhere = (
+        start_run(sequence, cfg, out, resume=True, extends=True, say=lambda text: None) for out in (once, parts)
+    )
+    here.complete()
+    assert isinstance(elsewhere, WindowedRun)
+    with elsewhere.opened() as out:
+        for training in trainings(elsewhere):
+            train_here(training)
+        elsewhere.join(out)
+    assert (parts / "windows/002/scene.safetensors").read_bytes() == (
+        once / "windows/002/scene.safetensors"
+    ).read_bytes()
 
 
 def test_other_data_or_another_config_do_not_resume(trained, make_tiny_sequence):
