@@ -64,6 +64,9 @@ def test_a_run_records_the_frames_and_names_them_with_the_command(sequence, tmp_
     assert len(line.splitlines()) == 1
     assert main(["eval", str(run), "--no-networks"]) == 0
     assert json.loads((run / "metrics.json").read_text())["protocol"]["missed_tool_frames"] == [MISSED]
+    with open(run / LOG, "a", encoding="utf-8") as lines:  # of an extended run the last line counts
+        lines.write(json.dumps(last | {"iteration": 30, "missed_tool_frames": []}) + "\n")
+    assert missed_tools_of(run) == []
 
 
 def test_a_resumed_training_has_the_same_shares(sequence, tmp_path):

@@ -135,3 +135,12 @@ def test_doubt_begins_when_the_scene_explains_resting_tissue(phantom, monkeypatc
     trainer.start()
     trainer.run([])
     assert len(calls) == 18
+    longer = GaussianTrainer(trainer.sequence, cfg.extended(1000))  # a tenth of it is not done yet
+    state = trainer.state
+    arrays = state.arrays()
+    for shown, more in ((0.0, 0), (0.1, 1)):  # once masks were in doubt, they stay so when the run is extended
+        shares = torch.full_like(arrays["left_out"], shown)
+        longer.restore(state.stage, state.iteration, arrays | {"left_out": shares})
+        calls.clear()
+        longer.step()
+        assert len(calls) == more

@@ -13,7 +13,8 @@ from endoprior.cli import main
 from endoprior.cli.train import Train
 from endoprior.core.checks import InputError
 from endoprior.model.presets import preset
-from endoprior.runs.folder import config_of_run, read_config
+from endoprior.runs.folder import config_of_run, read_config, sequence_of_run
+from endoprior.runs.train import start_run
 
 QUICK = [
     "--preset", "paper", "--seed", "3", "--init-budget", "200", "--schedule.coarse-iterations", "2",
@@ -136,3 +137,90 @@ def test_bad_config_files(tmp_path, name, text, says):
     with pytest.raises(InputError) as caught:
         read_config(tmp_path / name, preset())
     assert str(caught.value).startswith(f"{tmp_path / name}: ") and says in str(caught.value)
+
+
+def extended(run: Path, to: Path, total: int, stop_at: int = 0, seconds: float = 60) -> Path:
+    """A copy of the run, extended to so many iterations; killed after fine iteration `stop_at` if it is given."""
+    out = Path(shutil.copytree(run, to))
+    if not stop_at:
+        assert main(["train", "--resume", str(out), "--iterations", str(total), "--no-networks"]) == 0
+        return out
+
+    def kill(report, trainer):
+        if report.iteration == stop_at:
+            raise RuntimeError("killed")
+
+    cfg = config_of_run(out).extended(total)
+    sequence = endoprior.load_sequence(sequence_of_run(out), cfg.data)
+    with pytest.raises(RuntimeError, match="killed"):
+        run_on = start_run(sequence, cfg, out, resume=True, extends=True, say=lambda text: None)
+        run_on.complete(kill, checkpoint_seconds=seconds)
+    return out
+
+
+@pytest.mark.parametrize("seconds", [0, 60])  # 60: a kill leaves the checkpoint from before the extension
+def test_a_finished_run_is_extended_and_a_killed_extension_resumes(interrupted, tmp_path, seconds):
+    whole = interrupted[2].parent
+    before = config_of_run(whole)
+    assert (whole / "metrics.json").is_file()
+    once = extended(whole, tmp_path / "once", 20)
+    cfg = config_of_run(once)
+    density = replace(before.density, stop_iteration=12)
+    assert cfg == replace(before, schedule=replace(before.schedule, fine_iterations=18), density=density)
+    logged = [json.loads(line)["iteration"] for line in (once / "log.jsonl").read_text().splitlines()]
+    assert logged[-1] == 10 and (once / "metrics.json").is_file()
+    scene = (once / "scene.safetensors").read_bytes()
+    assert scene != (whole / "scene.safetensors").read_bytes()
+
+    killed = extended(whole, tmp_path / "killed", 20, stop_at=16, seconds=seconds)
+    assert config_of_run(killed) == cfg
+    assert not [name for name in ("scene.safetensors", "metrics.json") if (killed / name).exists()]
+    assert main(["train", "--resume", str(killed), "--no-networks"]) == 0
+    assert (killed / "scene.safetensors").read_bytes() == scene
+
+
+def test_an_extension_is_the_training_of_that_config_from_the_checkpoint_on(interrupted, parts, tmp_path):
+    """Growth does not reach these iterations, so that the run of the extended config has the same first ones."""
+    once = extended(interrupted[2].parent, tmp_path / "once", 20)
+    assert main(["train", "--resume", str(parts), "--iterations", "20", "--no-networks"]) == 0
+    cfg = config_of_run(once)
+    endoprior.train(endoprior.load_sequence(interrupted[0]), cfg, tmp_path / "new")
+    for run in (parts, tmp_path / "new"):
+        assert (run / "scene.safetensors").read_bytes() == (once / "scene.safetensors").read_bytes()
+
+
+def test_a_stopped_run_can_be_made_shorter(parts):
+    assert main(["train", "--resume", str(parts), "--iterations", "10", "--no-networks"]) == 0
+    assert config_of_run(parts).schedule.total == 10
+    assert (parts / "scene.safetensors").is_file()
+
+
+@pytest.mark.parametrize("total", ["14", "13", "3", "2", "1"])
+def test_an_extension_that_is_none(interrupted, tmp_path, total, capsys):
+    run = Path(shutil.copytree(interrupted[2].parent, tmp_path / "run"))
+    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    capsys.readouterr()
+    assert main(["train", "--resume", str(run), "--iterations", total]) == 2
+    says = "of the coarse stage" if int(total) <= 2 else f"more than the 14 of 14 iterations that {run} has done"
+    assert f"--iterations: expected {'more than the 2 ' if int(total) <= 2 else ''}{says}" in (
+        text := complaint(capsys)
+    )
+    assert f"got {total}. Fix: Choose more." in text
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+
+
+def test_an_extension_changes_the_length_only(interrupted, parts, capsys):
+    before = (parts / "config.json").read_bytes()
+    assert main(["train", "--resume", str(parts), "--iterations", "5"]) == 2
+    assert f"more than the 7 of 14 iterations that {parts} has done, got 5" in complaint(capsys)
+    for options, says in (
+        (["--seed", "4"], "seed (3 in the folder, 4 now)"),
+        (["--density.stop-iteration", "7"], "density.stop_iteration (12 in the folder, 7 now)"),
+        (["--schedule.fine-iterations", "15"], "schedule.fine_iterations (12 in the folder, 15 now)"),
+        (["--preset", "paper"], "schedule.fine_iterations (12 in the folder, "),
+    ):
+        assert main(["train", str(parts), "--resume", "--iterations", "20", *options]) == 2
+        assert says in complaint(capsys)
+    assert main(["train", str(interrupted[0]), str(parts), "--resume", "--schedule.fine-iterations", "20"]) == 2
+    assert "schedule.fine_iterations (12 in the folder, 20 now)" in complaint(capsys)
+    assert (parts / "config.json").read_bytes() == before

@@ -29,7 +29,8 @@ from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file
-from endoprior.runs.train import start_run, train
+from endoprior.runs.remote import train_here, trainings
+from endoprior.runs.train import WindowedRun, start_run, train
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
@@ -340,6 +341,51 @@ def test_resuming_gives_the_bits_of_an_uninterrupted_run(trained, tmp_path):
     train(load_sequence(data), cfg, out, resume=True)
     for file in ("scene.safetensors", *(f"windows/{k:03d}/scene.safetensors" for k in range(3))):
         assert (out / file).read_bytes() == (run / file).read_bytes()
+
+
+@pytest.mark.parametrize("killed_after", [5, 12])  # in the first window that goes on, and in the second one
+def test_every_window_is_extended(trained, tmp_path, killed_after):
+    data, run = trained
+    cfg, seen = in_windows(tiny_config("basis")).extended(30), []
+    sequence = load_sequence(data)
+
+    def kill(report, trainer):
+        seen.append(report.iteration)
+        if len(seen) == killed_after:
+            raise RuntimeError("killed")
+
+    once, parts = (Path(shutil.copytree(run, tmp_path / name)) for name in ("once", "parts"))
+    started = start_run(sequence, cfg, once, resume=True, extends=True, say=lambda text: None)
+    started.complete()
+    second = start_run(sequence, cfg, parts, resume=True, extends=True, say=lambda text: None)
+    with pytest.raises(RuntimeError, match="killed"):
+        second.complete(kill)
+    assert seen[0] == 15 and not (parts / "scene.safetensors").exists()
+    train(out=parts, resume=True)
+    for file in ("scene.safetensors", *(f"windows/{k:03d}/scene.safetensors" for k in range(3))):
+        assert (parts / file).read_bytes() == (once / file).read_bytes() != (run / file).read_bytes()
+    last = [json.loads(line) for line in (once / "log.jsonl").read_text().splitlines()][-1]
+    assert (last["window"], last["iteration"]) == (2, 20)
+    with pytest.raises(InputError, match="more than the 30 of 30 iterations"):
+        start_run(sequence, cfg, once, resume=True, extends=True, say=lambda text: None)
+
+
+def test_another_process_extends_every_window(trained, tmp_path):
+    data, run = trained
+    cfg, sequence = in_windows(tiny_config("basis")).extended(30), load_sequence(data)
+    once, parts = (Path(shutil.copytree(run, tmp_path / name)) for name in ("once", "parts"))
+    here, elsewhere = (
+        start_run(sequence, cfg, out, resume=True, extends=True, say=lambda text: None) for out in (once, parts)
+    )
+    here.complete()
+    assert isinstance(elsewhere, WindowedRun)
+    with elsewhere.opened() as out:
+        for training in trainings(elsewhere):
+            train_here(training)
+        elsewhere.join(out)
+    assert (parts / "windows/002/scene.safetensors").read_bytes() == (
+        once / "windows/002/scene.safetensors"
+    ).read_bytes()
 
 
 def test_other_data_or_another_config_do_not_resume(trained, make_tiny_sequence):

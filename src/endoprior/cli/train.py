@@ -38,7 +38,8 @@ class Train(Command):
     """Config of another run (config.json), or YAML with some fields. It overrides the preset; options override it."""
     iterations: int = 0
     """Length of the training. What begins and ends in between keeps its share of it; in
-    presets that follow a publication it keeps its number."""
+    presets that follow a publication it keeps its number. With `--resume RUN`: its new length; rates stay where they
+    ended, and no Gaussians are added after its former end."""
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
@@ -58,7 +59,7 @@ class Train(Command):
     """Port of --view; 0 uses any free port."""
     config: Config = field(default_factory=Config, metadata={"name": ""})
 
-    examples = ("DATA RUN", "DATA RUN --iterations 3000 --gaussians 50000", "--resume RUN")
+    examples = ("DATA RUN", "DATA RUN --iterations 3000 --gaussians 50000", "--resume RUN --iterations 3000")
     basics = (
         "--preset --config --seed --data.first-frames --data.shrink --iterations --resume"
         " --gaussians --device --view --no-networks --weights-dir"
@@ -80,7 +81,7 @@ class Train(Command):
         if typed.iterations is not None:
             cfg = cfg.replace({"iterations": typed.iterations})
         args = parse(cls, argv, "train", preset=name, config=cfg, iterations=cfg.schedule.total)
-        if typed.iterations is not None and cfg.schedule.literal:
+        if typed.iterations is not None and cfg.schedule.literal and not args.resume:
             say(
                 "note: this preset follows a publication, so only the length changes; density control begins at "
                 f"iteration {cfg.density.start_iteration:,}, the temporal term at {cfg.temporal.start_iteration:,}, "
@@ -93,7 +94,11 @@ class Train(Command):
             return args
         data, run = args.data, args.out or args.data
         if typed.preset is None and file is None and (args.out is None or (run / "config.json").is_file()):
-            args = parse(cls, argv, "train", preset=name, config=config_of_run(run))
+            cfg = config_of_run(run)
+            cfg = cfg if typed.iterations is None else cfg.extended(typed.iterations)
+            args = parse(cls, argv, "train", preset=name, config=cfg)
+        else:  # every option repeats one of the run
+            args = replace(args, iterations=0)
         if args.out is None:
             data = sequence_of_run(run, "`endoprior train DATA RUN --resume` with the folder of the sequence.")
         return replace(args, data=data, out=run)
@@ -124,7 +129,9 @@ class Train(Command):
         from ..training.trainer import device_for
 
         out = self.out or self.data
-        training = start_run(load_sequence(self.data, cfg.data), cfg, out, resume=self.resume, say=say)
+        extends = self.resume and self.iterations == cfg.schedule.total  # 0 if it was not typed
+        sequence = load_sequence(self.data, cfg.data)
+        training = start_run(sequence, cfg, out, resume=self.resume, extends=extends, say=say)
         began = clock.perf_counter()
         try:
             if self.ray:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
 
-from .checks import InputError, check_range, read_ranges
+from .checks import InputError, check_range, input_error, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
 from .former_config import current_form
@@ -284,6 +284,21 @@ class Config(Checked):
         values = to_dict(self)
         override(values, changes, "config")
         return from_dict(type(self), values)
+
+    def extended(self, total: int) -> Config:
+        """The config of a run that goes on until so many iterations: rates stay low, and growth does not begin anew.
+
+        Raises:
+            InputError: the coarse stage alone is as long.
+        """
+        coarse, fine = self.schedule.coarse_iterations, self.schedule.fine_iterations
+        if total == self.schedule.total:
+            return self
+        if total <= coarse:
+            want = f"more than the {coarse:,} of the coarse stage"
+            raise input_error("--iterations", want, f"{total:,}", "choose more.")
+        density = replace(self.density, stop_iteration=min(self.density.stop_iteration, fine))
+        return replace(self, schedule=replace(self.schedule, fine_iterations=total - coarse), density=density)
 
     def fitted(self, num_frames: int) -> Config:
         """The config with the fields filled in that depend on the length of the sequence."""

@@ -8,6 +8,7 @@ import sys
 import time as clock
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,10 @@ from ..data import FrameSequence
 from ..data.files import read_json
 from ..data.reading import kind_of, load_yaml, read_text
 from ..model.hexplane import TOUCHED
-from ..model.method import config_from
+from ..model.method import config_from, method_of
+from ..model.windowed_scene import window_file
 from ..render import ON_GPU
-from ..system.arrays_file import ArraySpec, load_arrays, rejecting, save_arrays
+from ..system.arrays_file import ArraySpec, load_arrays, load_facts, rejecting, save_arrays
 from ..system.atomic import is_leftover, reject_occupied, remove_leftovers, write_json
 from ..system.devices import name_of
 from ..system.file_lock import locked
@@ -39,6 +41,7 @@ CHECKPOINT_SECONDS = 60.0
 """Longest time of work that a crash can cost, besides the iteration in progress, unless told otherwise."""
 CHECKPOINT_SHARE = 0.05  # share of the time that writing checkpoints may take: large states are written less often
 FORMAT = "endoprior-checkpoint-1"
+RESTART = "Train again without --resume."
 
 
 def reject_unusable_folder(out: Path, *, resume: bool) -> None:
@@ -82,19 +85,27 @@ def held_folder(out: Path, *, resume: bool, begin: Callable[[], None]) -> Iterat
 
 
 def record_run(
-    out: Path, sequence: FrameSequence, cfg: Config, fingerprint: str, *, resume: bool, **facts: Any
+    out: Path,
+    sequence: FrameSequence,
+    cfg: Config,
+    fingerprint: str,
+    *,
+    resume: bool,
+    any_length: bool = False,
+    **facts: Any,
 ) -> None:
     """Write `config.json`: all that is needed to repeat the run, and `facts`.
 
     Raises:
-        InputError: the run to `resume` has another config or other data; or the data changed while they were read.
+        InputError: the run to `resume` has another config or other data (`reject_other_run`); or the data changed while
+            they were read.
     """
     about, backend = out / CONFIG, cfg.render.backend
     sequence.demand_unchanged()  # what was read before is of the same state
     if resume:
         stored = read_json(about, "start without --resume.", "a run to resume")
         known = _data_facts(stored).get("fingerprint")
-        reject_other_run(about, stored.get("config"), known, cfg, fingerprint, sequence.path)
+        reject_other_run(about, stored.get("config"), known, cfg, fingerprint, sequence.path, any_length=any_length)
     remove_leftovers(out)  # not before the run was accepted and has the lock
     names = ["endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless"]
     names += [backend] if backend in ON_GPU else []
@@ -111,14 +122,67 @@ def record_run(
 
 
 def reject_other_run(
-    file: Path, stored_config: Any, stored_fingerprint: Any, cfg: Config, fingerprint: str, data: Path
+    file: Path,
+    stored_config: Any,
+    stored_fingerprint: Any,
+    cfg: Config,
+    fingerprint: str,
+    data: Path,
+    *,
+    any_length: bool = False,
 ) -> None:
-    """Raise InputError where the stored config, naming all fields, or the stored data differ from the current ones."""
-    if changed := ", ".join(_differences(to_dict(config_of(stored_config, file)), to_dict(cfg))):
-        fix = f"`{command('train', '--resume', file.parent)}` takes the options of the folder"
-        raise InputError(f"{file}: config differs at {changed}. Fix: {fix}; a new run needs a new folder.")
+    """Raise InputError where the stored config, naming all fields, or the stored data differ from the current ones.
+
+    Args:
+        any_length: accept what `Config.extended` changes: the extension was checked before (`reject_unextendable`).
+    """
+    stored = config_of(stored_config, file)
+    if any_length:
+        schedule = replace(stored.schedule, fine_iterations=cfg.schedule.fine_iterations)
+        density = replace(stored.density, stop_iteration=cfg.density.stop_iteration)
+        stored = replace(stored, schedule=schedule, density=density)
+    _reject_other_config(file, stored, cfg)
     if stored_fingerprint != fingerprint:
         raise InputError(f"{file}: was trained on other data than {data}. Fix: Pass the same sequence.")
+
+
+def _reject_other_config(file: Path, stored: Config, cfg: Config) -> None:
+    if changed := ", ".join(_differences(to_dict(stored), to_dict(cfg))):
+        fix = f"`{command('train', '--resume', file.parent)}` takes the options of the folder"
+        raise InputError(f"{file}: config differs at {changed}. Fix: {fix}; a new run needs a new folder.")
+
+
+def reject_unextendable(run: Path, cfg: Config, num_frames: int) -> None:
+    """Raise InputError unless `cfg` makes the run longer, or a stopped one shorter, and changes nothing else."""
+    if not method_of(cfg).has_gaussians:
+        want = "a run of a method with Gaussians: rates of the others fall over the whole length"
+        raise input_error("--iterations", want, cfg.method, "remove it.")
+    file, wanted = run / CONFIG, cfg.schedule.total
+    stored = read_json(file, "pass the folder of a run.")
+    former = config_of(stored.get("config"), file)
+    _reject_other_config(file, former.extended(wanted).fitted(num_frames), cfg.fitted(num_frames))
+    windows = stored.get("windows")
+    parts = [window_file(run / SCENE, k).parent for k in range(len(windows))] if isinstance(windows, list) else [run]
+    done = [_iterations_done(part / CHECKPOINT, former) for part in parts]
+    if wanted < max(done) or wanted <= min(done):
+        want = f"more than the {max(done):,} of {former.schedule.total:,} iterations that {run} has done"
+        raise input_error("--iterations", want, f"{wanted:,}", "choose more.")
+
+
+def _iterations_done(checkpoint: Path, cfg: Config) -> int:
+    """Iterations of both stages that a checkpoint holds; 0 without one."""
+    if not checkpoint.is_file():
+        return 0
+    with rejecting(checkpoint, "a training state", RESTART):
+        about = load_facts(checkpoint, FORMAT, RESTART)
+        return int(about["iteration"]) + (cfg.schedule.coarse_iterations if Stage(about["stage"]) is Stage.FINE else 0)
+
+
+def remove_results(run: Path) -> None:
+    """Remove the scene of a run and its scores, before it is extended: a run with a scene counts as done."""
+    for pattern in (SCENE, "metrics*.json", "per_frame*.json"):
+        for file in run.glob(pattern):
+            file.unlink()
 
 
 def _differences(old: dict[str, Any], new: dict[str, Any], where: str = "") -> Iterator[str]:
@@ -231,16 +295,17 @@ def save_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
     save_arrays(path, state.arrays(), about | {"fingerprint": fingerprint}, FORMAT)
 
 
-def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
-    """Restore the saved state in `trainer`.
+def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str, *, any_length: bool = False) -> None:
+    """Restore the saved state in `trainer`; `any_length`: see `reject_other_run`.
 
     Raises:
         InputError: the file is missing or damaged, or belongs to another config or other data.
     """
-    cfg, sequence, next_step = trainer.cfg, trainer.sequence, "Train again without --resume."
+    cfg, sequence, next_step = trainer.cfg, trainer.sequence, RESTART
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
-        reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, sequence.path)
+        stored = (about["config"], about["fingerprint"])
+        reject_other_run(path, *stored, cfg, fingerprint, sequence.path, any_length=any_length)
         return trainer.schema()
 
     arrays, about = load_arrays(path, {FORMAT: schema}, next_step)

@@ -117,14 +117,14 @@ def missed_tools_of(run: Path) -> list[int] | None:
     """Frames of the sequence, ascending, in a run folder; None where training trusted the masks, or has no log."""
     if not (run / LOG).is_file():
         return None
-    windows, found = _windows(_config(run)), None
+    windows, found = _windows(_config(run)), dict[int, set[int]]()
     for line in read_log(run / LOG):
         try:
             frames, first = line[MISSED], int(windows[line["window"]][0]) if "window" in line else 0
-            found = (found or set()) | {first + int(frame) for frame in frames}
+            found[first] = {first + int(frame) for frame in frames}  # of an extended run the last line counts
         except (ValueError, KeyError, TypeError, IndexError):  # most lines
             continue
-    return None if found is None else sorted(found)
+    return sorted(set().union(*found.values())) if found else None
 
 
 def missed_tools_line(run: Path, data: Path) -> str:

@@ -32,6 +32,7 @@ class Training:
     resume: bool  # whether there must be a run in the folder already. One that is there is resumed in any case.
     threads: Threads
     checkpoint_seconds: float = CHECKPOINT_SECONDS
+    extends: bool = False  # whether that run gets the length of this config
 
     def __str__(self) -> str:
         return self.name
@@ -56,11 +57,11 @@ def trainings(run: TrainingRun | WindowedRun, checkpoint_seconds: float = CHECKP
     out, threads = run.out.absolute(), Threads.of_this_process()
     if isinstance(run, TrainingRun):
         data, cfg = run.trainer.sequence.path.absolute(), run.trainer.cfg
-        return [Training("the whole sequence", data, cfg, out, run.resume, threads, checkpoint_seconds)]
+        return [Training("the whole sequence", data, cfg, out, run.resume, threads, checkpoint_seconds, run.extends)]
     data, left = run.sequence.path.absolute(), []
     for k in run.waiting(out):
         cfg, folder = window_config(run.cfg, *run.plan[k]), window_file(out / SCENE, k).parent
-        left.append(Training(run.window_name(k), data, cfg, folder, False, threads, checkpoint_seconds))
+        left.append(Training(run.window_name(k), data, cfg, folder, False, threads, checkpoint_seconds, True))
     return left
 
 
@@ -70,7 +71,8 @@ def train_here(training: Training) -> Trained:
     began, notes = clock.perf_counter(), list[str]()
     resume = training.resume or (training.folder / CONFIG).is_file()
     sequence = load_sequence(training.data, training.cfg.data)
-    run = TrainingRun(sequence, training.cfg, training.folder, resume=resume, say=notes.append)
+    extends = resume and training.extends
+    run = TrainingRun(sequence, training.cfg, training.folder, resume=resume, extends=extends, say=notes.append)
     scene = run.complete(checkpoint_seconds=training.checkpoint_seconds)
     found = tuple(note for note in notes if note.startswith("note: "))
     return Trained(len(scene) if isinstance(scene, Scene) else None, clock.perf_counter() - began, found)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
-from ..core.checks import input_error, read_ranges
+from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
@@ -41,7 +41,9 @@ from .folder import (
     held_folder,
     load_checkpoint,
     record_run,
+    reject_unextendable,
     reject_unusable_folder,
+    remove_results,
     save_checkpoint,
     sequence_of_run,
 )
@@ -99,11 +101,13 @@ def start_run(
     out: str | Path | None = None,
     *,
     resume: bool = False,
+    extends: bool = False,
     say: Callable[[str], None],
 ) -> TrainingRun | WindowedRun:
     """A run whose sequence, config and folder have been checked; its `complete` trains.
 
     Args:
+        extends: the run to resume gets the length of `cfg`, which is `Config.extended` of its config.
         say: takes lines for the user: what takes long, and what is suspicious about the sequence.
     Raises:
         InputError: see `train`.
@@ -116,6 +120,8 @@ def start_run(
         if wanted != found and field.name not in ("format", "eyes"):
             got = f"a sequence that was read with {found!r}"
             raise input_error(f"data.{field.name}", repr(wanted), got, "`load_sequence(DATA, config.data)`.")
+    if extends and out is not None:
+        reject_unextendable(Path(out), cfg, len(sequence))
     if cfg.windows.longest:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
@@ -124,8 +130,8 @@ def start_run(
             want, got = f"0 with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
             raise input_error("windows.longest", want, got, "Add --windows.longest 0.")
         if len(plan) > 1:
-            return WindowedRun(sequence, cfg, plan, out, resume=resume, say=say)
-    return TrainingRun(sequence, cfg, out, resume=resume, say=say)
+            return WindowedRun(sequence, cfg, plan, out, resume=resume, extends=extends, say=say)
+    return TrainingRun(sequence, cfg, out, resume=resume, extends=extends, say=say)
 
 
 class TrainingRun:
@@ -138,10 +144,11 @@ class TrainingRun:
         out: str | Path | None = None,
         *,
         resume: bool = False,
+        extends: bool = False,
         say: Callable[[str], None],
     ) -> None:
         """Check everything, cheap checks first, and compile the kernels if that was not done before."""
-        self.out, self.resume = Path(out) if out is not None else None, resume
+        self.out, self.resume, self.extends = Path(out) if out is not None else None, resume, extends
         if self.out:
             reject_unusable_folder(self.out, resume=resume)
         reject_too_large(sequence, cfg)
@@ -178,9 +185,21 @@ class TrainingRun:
         trainer, checkpoint = self.trainer, out / CHECKPOINT
         restored = self.resume and checkpoint.is_file()  # not if it was stopped before its first checkpoint
         if restored:
-            load_checkpoint(trainer, checkpoint, fingerprint)
-        compare_with_record = self.resume and not restored  # the checkpoint has been compared
-        record_run(out, trainer.sequence, trainer.cfg, fingerprint, resume=compare_with_record, **self.facts)
+            any_length = self.extends
+            with suppress(InputError):  # after a kill, the checkpoint may be one from before the run was extended
+                any_length |= config_of_run(out) == trainer.cfg
+            load_checkpoint(trainer, checkpoint, fingerprint, any_length=any_length)
+        if self.extends:
+            remove_results(out)
+        record_run(
+            out,
+            trainer.sequence,
+            trainer.cfg,
+            fingerprint,
+            resume=self.resume and not restored,  # the checkpoint has been compared
+            any_length=self.extends,
+            **self.facts,
+        )
         if not restored:
             trainer.start()
         cut_log(out / LOG, trainer.state.stage, trainer.state.iteration)
@@ -222,11 +241,12 @@ class WindowedRun:
         out: str | Path | None,
         *,
         resume: bool,
+        extends: bool = False,
         say: Callable[[str], None],
     ) -> None:
         """Check the folder; every window of the `plan`, from first frame to last + 1, is checked when it begins."""
         self.sequence, self.cfg, self.plan, self.say = sequence, cfg, plan, say
-        self.out, self.resume = Path(out) if out is not None else None, resume
+        self.out, self.resume, self.extends = Path(out) if out is not None else None, resume, extends
         if self.out:
             reject_unusable_folder(self.out, resume=resume)
         say(f"{sequence.path}: {len(sequence)} frames in {len(plan)} windows")
@@ -249,7 +269,11 @@ class WindowedRun:
 
         def begin() -> None:
             fingerprint = self.sequence.fingerprint()
-            record_run(out, self.sequence, self.cfg, fingerprint, resume=self.resume, windows=self.plan)
+            if self.extends:
+                for file in (out / SCENE, *(window_file(out / SCENE, k) for k in range(len(self.plan)))):
+                    remove_results(file.parent)
+            length = {"any_length": self.extends}
+            record_run(out, self.sequence, self.cfg, fingerprint, resume=self.resume, windows=self.plan, **length)
 
         with held_folder(out, resume=self.resume, begin=begin):
             yield out
@@ -280,7 +304,7 @@ class WindowedRun:
         self.say(self.window_name(k))
         part, cfg = self.sequence.part(start, stop), window_config(self.cfg, start, stop)
         resume = folder is not None and (folder / CONFIG).is_file()
-        run = TrainingRun(part, cfg, folder, resume=resume, say=self.say)
+        run = TrainingRun(part, cfg, folder, resume=resume, extends=resume, say=self.say)  # to the length of `cfg`
         return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
 
     def _scene(self, read: Callable[[int], RenderedScene]) -> WindowedScene:

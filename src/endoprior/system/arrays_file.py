@@ -107,6 +107,19 @@ def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[di
         return arrays, about
 
 
+def load_facts(path: Path, file_format: str, fix: str) -> dict[str, Any]:
+    """The metadata alone of a file written by `save_arrays`; the digest is not compared. See `load_arrays`."""
+    from safetensors import SafetensorError, safe_open
+
+    with rejecting(path, f"a file of format {file_format}", fix, SafetensorError, AttributeError):
+        _check_size(path)
+        with safe_open(path, "pt") as opened:
+            about = json.loads((opened.metadata() or {})[KEY], parse_constant=_reject_constant)
+        if about["format"] != file_format:
+            raise input_error(path, f"format {file_format}", f"{about['format']!r:.80}", fix)
+        return about
+
+
 @contextmanager
 def rejecting(path: Path, expected: str, fix: str, *others: type[Exception]) -> Iterator[None]:
     """Convert all errors that a wrong file can cause, including `others`, to an InputError about the file.

@@ -168,7 +168,7 @@ class TrainingStep:
         out = render(splats)
         out.means2d.retain_grad()  # density control grows where this gradient is large
         compared, left_out = frame, None
-        if self.doubt and fine and not is_right and iteration > START * stage_length(cfg, Stage.FINE):
+        if self.doubt and fine and not is_right and self._knows_tissue(state):
             compared = self.doubt.counted(frame, out.color)
             left_out = self.doubt.share(frame, compared)
         return Drawn(
@@ -187,6 +187,11 @@ class TrainingStep:
             is_right=is_right,
             left_out=left_out,
         )
+
+    def _knows_tissue(self, state: GaussiansState) -> bool:
+        """Whether the scene explains resting tissue; once begun, it stays so in a longer training."""
+        late = state.iteration + 1 > START * stage_length(self.cfg, Stage.FINE)
+        return late or (state.left_out is not None and bool(state.left_out.any()))
 
     def loss(self, state: GaussiansState, drawn: Drawn) -> tuple[dict[str, Tensor], Tensor]:
         """Weighted terms, () each; and the mean absolute color error over tissue, (), that the check watches."""
