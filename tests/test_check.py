@@ -308,7 +308,7 @@ def test_masks_of_the_border_alone_hold_no_tools(data):
     (finding,) = find(facts)
     assert (finding.code, finding.severity) == ("tool-fraction", "warning")
     assert "the masks cover only the border; if tools are in view, they become tissue" in finding.what
-    assert finding.fix.endswith(f"else paint them white (255) in {data}/masks, or run `prepare` with `--masks FOLDER`")
+    assert finding.fix.endswith(f"else paint them: `endoprior view {data}`, or run `prepare` with `--masks FOLDER`")
 
 
 def test_relative_lengths_are_not_called_mm(facts):

