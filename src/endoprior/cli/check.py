@@ -9,6 +9,7 @@ from typing import Literal
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
+from ..core.shell import quoted
 from ..system.console import say
 from .arguments import Command
 
@@ -34,7 +35,7 @@ class Check(Command):
         """Measure the sequence, print the report, write the figure."""
         figure = self.out or figure_beside(self.folder)
         if figure.suffix.lower() != ".png":
-            raise input_error("--out", "a .png file", str(figure), "end the name in .png.")
+            raise input_error("--out", "a .png file", str(figure), f"`--out {quoted(figure.with_suffix('.png'))}`.")
         from .paths import require_writable_file
 
         for option, file in (("--out", figure), ("--json", self.json)):
