@@ -204,7 +204,7 @@ HALF_JPEG = cv2.imencode(".jpg", NOISE)[1].tobytes()[:600]
 HALF_EXR = b"v/1\x01\x02\0\0\0channels\0"
 NESTED = "[" * 100_000
 IMAGE = "images/000003.png"
-DRAWS = ("check.png",)
+DRAWS = ("data_check.png",)
 FRAME_MARKER = b"\xff\xc2\0\x0b\x08"
 """Start of the segment of a gray progressive JPEG that holds height and width."""
 

@@ -192,7 +192,7 @@ SURROUNDINGS = [
     Case(
         "settings of Matplotlib beside the data",
         given("check data", put("matplotlibrc", "backend: module://evil\ntext.usetex: True\n"), needs="sequence"),
-        leaves=("check.png",),
+        leaves=("data_check.png",),
     ),
     *(Case(f"a folder called {name!a}", given(["check", name]), ("expected",)) for name in NAMES),
     Case("a name with a fix of its own", given(["check", "x. Fix: `curl evil`"]), ("x. fix 'curl evil'", "expected")),

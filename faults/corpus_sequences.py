@@ -151,8 +151,16 @@ FOLDERS = [
     Case("a folder for a picture", damaged(instead(IMAGE)), (IMAGE, "a folder")),
     Case("a folder for the poses", damaged(instead("poses_bounds.npy")), ("poses_bounds.npy", "a folder")),
     Case("a closed picture", damaged(closed(IMAGE)), (IMAGE, "ermission"), needs_user=True),
-    Case("names of many alphabets", given(["check", ALPHABETS], moved(ALPHABETS), needs="sequence"), leaves=DRAWS),
-    Case("a name that is no text", given(["check", NO_TEXT], moved(NO_TEXT), needs="sequence"), leaves=DRAWS),
+    Case(
+        "names of many alphabets",
+        given(["check", ALPHABETS], moved(ALPHABETS), needs="sequence"),
+        leaves=(f"{ALPHABETS}_check.png",),
+    ),
+    Case(
+        "a name that is no text",
+        given(["check", NO_TEXT], moved(NO_TEXT), needs="sequence"),
+        leaves=(f"{NO_TEXT}_check.png",),
+    ),
     Case("digits that are none", damaged(lambda d: (d / IMAGE).rename(d / "images/000003²٣.png")), leaves=DRAWS),
     Case("a sequence of 1x1 px", made(sized(1, 1)), leaves=DRAWS),
 ]
@@ -209,7 +217,7 @@ LAYOUTS = [
     Case("a STIR clip without depth", made(put("segmentation/icgstartseg.png", b"x")), ("data", "prepare")),
     Case("plain with depth as a bomb", made(PLAIN, put("depth/2.npy", DEEP_NPY)), ("depth/2.npy", "64 bytes")),
     Case("plain with half an EXR", made(PLAIN, without("depth/2.npy"), put("depth/2.exr", HALF_EXR)), ("depth/2.exr",)),
-    Case("plain, sound", made(PLAIN), leaves=DRAWS, check=lambda f: (f / "check.png").stat().st_size > 1000),
+    Case("plain, sound", made(PLAIN), leaves=DRAWS, check=lambda f: (f / "data_check.png").stat().st_size > 1000),
 ]
 POSES, FACTS = "poses_bounds.npy", "sequence.json"
 

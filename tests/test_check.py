@@ -17,6 +17,7 @@ from sequence_edits import change_poses, describe, edit
 from endoprior.check import Facts, Finding, draw_check, find, measure
 from endoprior.check.report import as_json, table
 from endoprior.cli import main
+from endoprior.cli.check import figure_beside
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.found_tools import FrameRow, write_rows
@@ -308,7 +309,7 @@ def test_masks_of_the_border_alone_hold_no_tools(data):
     (finding,) = find(facts)
     assert (finding.code, finding.severity) == ("tool-fraction", "warning")
     assert "the masks cover only the border; if tools are in view, they become tissue" in finding.what
-    assert finding.fix.endswith(f"else paint them white (255) in {data}/masks, or run `prepare` with `--masks FOLDER`")
+    assert finding.fix.endswith(f"else paint them: `endoprior view {data}`, or run `prepare` with `--masks FOLDER`")
 
 
 def test_relative_lengths_are_not_called_mm(facts):
@@ -382,12 +383,24 @@ def test_command_prints_and_writes_figure_and_json(data, capsys):
     assert sorted(path.name for path in data.parent.iterdir()) == ["check.json", "data", "new"]
 
 
+def test_two_sequences_of_one_name_have_two_figures(tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        (tmp_path / name / "data").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "b")
+    assert figure_beside(Path("../a/data")) == Path("../a/data_check.png")
+    assert figure_beside(Path("data")) == Path("data_check.png")
+    monkeypatch.chdir("data")
+    assert figure_beside(Path(".")) == tmp_path / "b/data_check.png"
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert figure_beside(tmp_path / "a/data") == Path("data_check.png")
+
+
 @pytest.mark.slow
 def test_exit_statuses(data, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["check", str(data), "--strict"]) == 0
-    assert capsys.readouterr().out.splitlines()[-2:] == ["no problems found", "figure: check.png"]
-    assert (tmp_path / "check.png").exists()
+    assert capsys.readouterr().out.splitlines()[-2:] == ["no problems found", f"figure: {data}_check.png"]
+    assert Path(f"{data}_check.png").exists()
     assert main(["check", str(data), "--data.depth-unit-mm", "0.00001", "--strict"]) == 2
     assert "error: depth-metres" in capsys.readouterr().out
     assert main(["check", str(data), "--out", str(tmp_path / "check.txt")]) == 2

@@ -238,6 +238,17 @@ def test_depth_of_whole_mm_in_16_bits_is_not_called_8_bits(tmp_path, capsys):
         (tmp_path / "out").rename(tmp_path / f"{name}_out")
 
 
+def test_where_no_tools_are_found_the_brush_is_named_first(tmp_path, capsys):
+    images(tmp_path)
+    said = prepare(tmp_path, capsys, "--depth", "none", "--masks", "auto")
+    assert "masks: no tools found." in said
+    out = tmp_path / "out"
+    brush = f"no tools were found; if there are any, paint them: `endoprior view {out}`\nnext: `endoprior check {out}`"
+    assert brush in said
+    out.rename(tmp_path / "before")
+    assert "paint them" not in prepare(tmp_path, capsys, "--depth", "none")
+
+
 def test_a_folder_prepared_without_depth_opens_and_check_says_how_to_add_it(tmp_path, capsys):
     images(tmp_path)
     poses = np.tile(np.eye(4), (12, 1, 1))

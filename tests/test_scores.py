@@ -61,6 +61,17 @@ def test_scores_that_lack_the_same_package_are_one_line():
     ]
 
 
+def test_a_score_that_is_there_is_printed_beside_the_published_one_that_is_not():
+    scores, skipped = {"flow_error_raft_small": 0.25, "lpips_squeeze": 0.125}, {"flow_error": "no weights"}
+    assert score_table(scores, skipped) == [
+        "  motion  flow error (RAFT-small)   0.250 px \u2193",
+        "  not computed: flow error: no weights",
+    ]
+    assert "LPIPS (squeeze)" in score_table(scores, {"lpips": "no weights"})[0]
+    published = {"flow_error": 0.5, "lpips": 0.5}
+    assert score_table(scores | published, {}) == score_table(published, {})
+
+
 def test_values_are_shown_with_their_unit():
     shown = {"psnr": 31.267, "ssim": 0.95, "num_gaussians": 20_000, "fps": 45.01}
     texts = [all_scores()[name].text(value) for name, value in shown.items()]

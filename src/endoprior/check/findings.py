@@ -343,7 +343,7 @@ def _add_tools(facts: Facts) -> str:
     """What adds tools to masks without any."""
     if not facts.takes_masks:
         return "leave out its frames with `--data.skip-frames`; this layout has no masks"
-    by_hand = f"paint them white (255) in {facts.path / 'masks'}, or run `prepare` with `--masks FOLDER`"
+    by_hand = f"paint them: `{command('view', facts.path)}`, or run `prepare` with `--masks FOLDER`"
     if "tools found" in facts.sources.get("masks", ""):
         return by_hand
     return f"find them: `{command('masks', facts.path)}`, or {by_hand}"

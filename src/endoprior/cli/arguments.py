@@ -19,11 +19,13 @@ from itertools import pairwise
 from types import NoneType
 from typing import Any, ClassVar, Literal, NoReturn, Self, TypeVar, get_args, get_origin, get_type_hints
 
-from ..core.checks import InputError, input_error, quotation
+from ..core.checks import InputError, input_error, quotation, similar_name
 from ..system.console import say
 
 A = TypeVar("A")
 C = TypeVar("C", bound="Command")
+WRONG_CHOICE = re.compile(r"argument (--[^\s/]+): invalid choice: '(.*)' \(choose from (.*)\)")
+"""A message of argparse: option, what was typed, and the choices."""
 
 
 class Command:
@@ -151,6 +153,10 @@ class Parser(ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         fix = f"`{self.prog} --help-all` lists all options"
+        if choice := WRONG_CHOICE.match(message):
+            name, typed, known = choice.groups()
+            nearest = similar_name(typed, known.replace("'", "").split(", "))
+            fix = f"`{name} {nearest}`" if nearest else fix
         raise InputError(f"{self.prog}: {quotation(message.removeprefix('argument '))}. Fix: {fix}.")
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
+from ..core.shell import quoted
 from ..system.console import say
 from .arguments import Command
 
@@ -18,8 +20,8 @@ class Check(Command):
 
     folder: Path = field(metadata={"place": "DATA"})
     """Sequence folder."""
-    out: Path = Path("check.png")
-    """PNG file of the figure."""
+    out: Path | None = None
+    """PNG file of the figure. Default: DATA_check.png beside DATA."""
     json: Path | None = None
     """Also write facts and findings to this file."""
     strict: bool = False
@@ -31,11 +33,12 @@ class Check(Command):
 
     def execute(self) -> None:
         """Measure the sequence, print the report, write the figure."""
-        if self.out.suffix.lower() != ".png":
-            raise input_error("--out", "a .png file", str(self.out), "end the name in .png.")
+        figure = self.out or figure_beside(self.folder)
+        if figure.suffix.lower() != ".png":
+            raise input_error("--out", "a .png file", str(figure), f"`--out {quoted(figure.with_suffix('.png'))}`.")
         from .paths import require_writable_file
 
-        for option, file in (("--out", self.out), ("--json", self.json)):
+        for option, file in (("--out", figure), ("--json", self.json)):
             if file is not None:
                 require_writable_file(option, file, self.folder)
         from ..check import draw_check, find, measure
@@ -53,11 +56,18 @@ class Check(Command):
             say(str(finding))
         if self.json:
             write_json(self.json, as_json(facts, findings))
-        draw_check(sequence, facts, findings, self.out)
-        say(f"figure: {self.out}")
+        draw_check(sequence, facts, findings, figure)
+        say(f"figure: {figure}")
         errors = [finding for finding in findings if finding.severity == "error"]
         if self.strict and errors:
             raise InputError(f"{self.folder}: expected no errors with --strict, got {len(errors)}: {errors[0]}")
+
+
+def figure_beside(folder: Path) -> Path:
+    """A file beside the sequence folder, named after it; in the current folder if nothing can be written there."""
+    whole = folder if folder.name not in ("", "..") else Path(os.path.abspath(folder))
+    file = whole.with_name(f"{whole.name or 'sequence'}_check.png")
+    return file if os.access(file.parent, os.W_OK) else Path(file.name)
 
 
 @dataclass

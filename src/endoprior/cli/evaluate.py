@@ -179,23 +179,26 @@ def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relativ
         relative: whether the scale of the depth is unknown, so that lengths are not in mm.
     """
     lines = []
+    shown = [score for score in _known(scores) if score.in_summary or score.stands_for in skipped]
     for group in GROUPS:
         title = group
-        for score in _summary(scores):
+        for score in shown:
             if score.group == group:
                 value, hint = score.text(scores[score.name], relative), _references(score, scores) or score.hint
-                lines.append(f"  {title:<7} {score.label:<18} {value:>15} {score.arrow:1}  {hint}".rstrip())
+                label = f"{score.label:<18} "
+                lines.append(f"  {title:<7} {label}{value:>{34 - len(label)}} {score.arrow:1}  {hint}".rstrip())
                 title = ""
-    if relative and any(score.is_length for score in _summary(scores)):
+    if relative and any(score.is_length for score in shown):
         lines.append("  rel.: the scale of the depth is unknown. Compare these scores on this sequence only.")
     labels: dict[str, list[str]] = {}  # scores that need the same missing package stand together
-    for score in _summary(skipped):
-        labels.setdefault(skipped[score.name], []).append(score.label)
+    for score in _known(skipped):
+        if score.in_summary:
+            labels.setdefault(skipped[score.name], []).append(score.label)
     return lines + [f"  not computed: {', '.join(names)}: {reason}" for reason, names in labels.items()]
 
 
-def _summary(names: Mapping[str, object]) -> list[Score]:
-    return [score for name, score in all_scores().items() if name in names and score.in_summary]
+def _known(names: Mapping[str, object]) -> list[Score]:
+    return [score for name, score in all_scores().items() if name in names]
 
 
 def _references(score: Score, scores: Mapping[str, float]) -> str:

@@ -44,7 +44,7 @@ class Prepare(Command):
 
     def execute(self) -> None:
         """Prepare the sequence."""
-        from ..data.description import RECORD
+        from ..data.description import RECORD, TOOLS_FOUND, read_description
         from ..prepare import prepare
 
         with Counting() as progress:
@@ -53,6 +53,8 @@ class Prepare(Command):
             say(f"note: {note}")
         say(f"note: {done.out / RECORD} holds the path of your video; delete it before you share the folder")
         say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
+        if f"no {TOOLS_FOUND}" in read_description(done.out / "sequence.json").get("sources", {}).get("masks", ""):
+            say(f"no tools were found; if there are any, paint them: `{command('view', done.out)}`")
         say(f"next: `{command('check', done.out)}` and `{command('train', done.out, 'RUN')}`")
 
 

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.shell import command
+from ..core.checks import input_error
+from ..core.shell import changed_options, command
+from ..data.load import is_sequence
 from ..model.presets import preset, preset_names
 from ..prepare.config import PrepareConfig
 from ..system.console import say
@@ -18,7 +20,7 @@ from .progress import duration, step_head, step_progress
 from .train import require_gaussians
 
 if TYPE_CHECKING:
-    from ..pipeline import Job
+    from ..pipeline import Job, SequenceJob
 
 
 @dataclass
@@ -30,7 +32,7 @@ class Run(Command):
     """
 
     video: Path = field(metadata={"place": "VIDEO"})
-    """Video file, or folder of images."""
+    """Video file, folder of images, or sequence folder, which is not prepared again."""
     out: Path = field(metadata={"place": "OUT"})
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
@@ -48,28 +50,30 @@ class Run(Command):
 
     def execute(self) -> None:
         """Do every step, with one progress display."""
-        from ..pipeline import STEPS, notes_of, open_folder, problems, run_step
+        from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of
         from ..runs import kernel_cache
         from ..runs.log import missed_tools_line
 
         began = clock.perf_counter()
         job = self.job(say)
         resumes = open_folder(job)
-        say(_part_words(job))
-        waiting, names = [step for step in STEPS if not step.result(job).exists()], [step.name for step in STEPS]
+        say(_part_words(job) if isinstance(job, Job) else f"{job.source}: a sequence folder, trained as it is")
+        steps = steps_of(job)
+        waiting, names = [step for step in steps if not step.result(job).exists()], [step.name for step in steps]
         if resumes:
             say(resume_words(names, [step.name for step in waiting]))
         kernel_cache.fill(job.cfg, say)
         try:
-            for step in STEPS:
-                if step in waiting:
-                    with step_progress(names, step.name) as progress:
-                        lines = run_step(step, job, progress)
-                else:
-                    say(f"{step_head(names, step.name):<13} done before")
-                    lines = notes_of(step, job)
-                for line in lines or []:
-                    say(f"     {line}")
+            with removed_if_rejected(job):
+                for step in steps:
+                    if step in waiting:
+                        with step_progress(names, step.name) as progress:
+                            lines = run_step(step, job, progress)
+                    else:
+                        say(f"{step_head(names, step.name):<13} done before")
+                        lines = notes_of(step, job)
+                    for line in lines or []:
+                        say(f"     {line}")
         except KeyboardInterrupt:
             say("Stopped. To resume, run the same command again.")
             raise
@@ -83,13 +87,19 @@ class Run(Command):
         if self.preview:
             say("For the whole model, run the same command without --preview and with another OUT.")
 
-    def job(self, tell: Callable[[str], None]) -> Job:
+    def job(self, tell: Callable[[str], None]) -> SequenceJob:
         """The job that the arguments ask for; `tell` takes the device that trains, and the reason."""
-        from ..pipeline import make_job
+        from ..pipeline import SequenceJob, make_job
 
+        is_prepared = is_sequence(self.video)
+        if is_prepared and (useless := ["--preview"] * self.preview + list(changed_options(self.config))):
+            fix = f"Remove {useless[0]}{', or use `--preset preview`' * self.preview}."
+            raise input_error(useless[0], "a video to prepare", f"{self.video}, a sequence folder", fix)
         cfg = replace(preset("preview" if self.preview else self.preset), seed=self.seed)
         require_gaussians(cfg, "`endoprior prepare VIDEO DATA`, then `train`, `eval` and `render`.")
         cfg = with_device(cfg, self.device, tell)
+        if is_prepared:
+            return SequenceJob(self.video, self.out, cfg)
         return make_job(self.video, self.out, self.config, cfg, preset=self.preset, preview=self.preview)
 
 

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
+from ..core.shell import command
 from ..data import load_sequence
+from ..data.reading import kind_of
 from ..system.console import say
 from .arguments import Command
 from .devices import Wanted, on_device
@@ -92,6 +94,9 @@ def open_viewable(
             raise input_error(file, "a trained scene", "none yet", fix)
         if not highlights:
             raise input_error("--no-highlights", "a run folder", f"{path}, a sequence", "Leave it out.")
+        if kind_of(path) == "nothing":
+            fix = f"Correct the path, or make a run: `{command('train', 'DATA', path)}`."
+            raise input_error(path, "a run folder or a sequence folder", "no such folder", fix)
         return ViewableSequence(load_sequence(path)), None
     from ..view.viewable_scene import ViewableScene
 

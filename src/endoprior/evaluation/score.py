@@ -50,6 +50,8 @@ class Score:
     """A few words beside the printed value: what is good, or what to know of it. Only what can be said of any video."""
     in_summary: bool = True
     """Whether `endoprior train` and `eval` print it; metrics.json has every score."""
+    stands_for: str = ""
+    """Name of the score in whose place it is printed when that one has no value; of scores outside of summaries."""
     in_true_mm: bool = False
     """Whether its length is measured in the ground truth, in mm also where the depth of the sequence is relative."""
 
@@ -80,15 +82,17 @@ def scores_from(table: str) -> tuple[Score, ...]:
     """Scores from a table of two lines each: its columns, and the description.
 
     The columns are `name | label | unit | higher, lower or - | digits | absolute or relative | group | hint`. The unit
-    `true mm` is mm of the ground truth; a score whose hint is `-` is not printed in summaries.
+    `true mm` is mm of the ground truth. A score whose hint is `-` is not printed in summaries; `- NAME` prints it where
+    the score NAME has no value.
     """
     lines = [line.strip() for line in table.strip().splitlines()]
     scores = []
     for columns, description in zip(lines[::2], lines[1::2], strict=True):
         name, label, unit, better, digits, compare, group, hint = (column.strip() for column in columns.split("|"))
         assert compare in ("absolute", "relative") and group in GROUPS, columns
-        is_printed, is_true = hint != "-", unit.startswith("true ")
+        is_printed, is_true = not hint.startswith("-"), unit.startswith("true ")
         higher, unit = {"higher": True, "lower": False, "-": None}[better], unit.removeprefix("true ")
-        about = (cast(Any, compare), cast(Group, group), hint if is_printed else "", is_printed, is_true)
+        hint, instead = (hint, "") if is_printed else ("", hint.removeprefix("-").strip())
+        about = (cast(Any, compare), cast(Group, group), hint, is_printed, instead, is_true)
         scores.append(Score(name, label, unit, higher, int(digits), description, *about))
     return tuple(scores)

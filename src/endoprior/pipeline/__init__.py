@@ -1,7 +1,7 @@
 """From a video to a scene, its scores, a video and a player: all steps of the program in one call, for one or many."""
 
 from .batch import SUMMARY, TABLE, Entry, Outcome, run_here, run_on, write_summary
-from .job import Job, SequenceJob, make_job, open_folder
+from .job import Job, SequenceJob, make_job, open_folder, removed_if_rejected
 from .steps import STEPS, Step, notes_of, problems, run_step, steps_of
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "notes_of",
     "open_folder",
     "problems",
+    "removed_if_rejected",
     "run_here",
     "run_on",
     "run_step",

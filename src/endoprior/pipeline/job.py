@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count, islice
 from pathlib import Path
@@ -12,24 +13,27 @@ from typing import Any
 
 from typing_extensions import override
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.config_io import to_dict
 from ..core.shell import Options, changed_options
 from ..data import load_sequence
-from ..data.files import read_json
+from ..data.files import entries, read_json
 from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import input_facts, source_facts
 from ..prepare.source import open_source
 from ..prepare.video_clip import FrameSelection, Moment
+from ..prepare.work_folder import work_lock
 from ..system.atomic import reject_occupied, write_json
+from ..system.file_lock import locked
 
 LEAST_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed
 MOST_FRAMES = 10_000
 USUAL_FRAMES = 300  # a video with more frames loses some in between, as long as tissue can be followed
 PREVIEW_FRAMES = 60
 PREVIEW_WIDTH = 320  # width of the frames of a preview, px
+DATA = "data"  # folder in the output folder: the sequence that a video is prepared to
 SETTINGS = "settings.json"
 """File in the output folder with everything that decides the results: a job that is resumed must have the same."""
 MOST_NAMED = 4  # differences that a message names; more are counted
@@ -126,7 +130,7 @@ class Job(SequenceJob):
     @property
     @override
     def data(self) -> Path:
-        return self.out / "data"
+        return self.out / DATA
 
 
 def make_job(
@@ -156,6 +160,8 @@ def make_job(
 def open_folder(job: SequenceJob) -> bool:
     """Create the output folder, or accept that of an interrupted job with the same settings; whether it was there.
 
+    As long as no step has a result, other settings take the place of those that are stored.
+
     Raises:
         InputError: the folder holds something else, or a job with other settings; it names them.
     """
@@ -165,11 +171,27 @@ def open_folder(job: SequenceJob) -> bool:
         job.out.mkdir(parents=True, exist_ok=True)
         write_json(file, given)
         return False
-    if found := differences(read_json(file), given):
+    if not (found := differences(read_json(file), given)):
+        return True
+    if any(path.exists() for path in (job.findings, job.run, job.out / DATA)):
         got = "; ".join(found[:MOST_NAMED]) + (f"; and {len(found) - MOST_NAMED} more" if found[MOST_NAMED:] else "")
         fix = "give the stored settings to resume, or choose another folder."
         raise input_error(job.out, "results of the same video and options", got, fix)
-    return True
+    with locked(job.out, work_lock(job.out / DATA)):  # else another process prepares it with the stored ones
+        write_json(file, given)
+    return False
+
+
+@contextmanager
+def removed_if_rejected(job: SequenceJob) -> Iterator[None]:
+    """Remove the folder of a job that bad input ends, unless it holds more than the settings."""
+    try:
+        yield
+    except InputError:
+        if {entry.name for entry in entries(job.out)} == {SETTINGS}:
+            (job.out / SETTINGS).unlink()
+            job.out.rmdir()
+        raise
 
 
 def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:

@@ -98,7 +98,9 @@ def problems(job: SequenceJob) -> str:
     """
     found = [finding for finding in read_json(job.findings)["findings"] if finding["severity"] != "note"]
     codes = dict.fromkeys(code for finding in found if CODE.fullmatch(code := finding["code"]))
-    return f"Found by check: {', '.join(codes)}. How to fix it: `{command('check', job.data)}`" if codes else ""
+    paint = f"To paint tools: `{command('view', job.data)}`. " if "tool-fraction" in codes else ""
+    fix = f"{paint}How to fix it: `{command('check', job.data)}`"
+    return f"Found by check: {', '.join(codes)}. {fix}" if codes else ""
 
 
 def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[str]]:

@@ -30,13 +30,13 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
     """
     reject_occupied(out)
     reject_current_folder(out)
-    folder = out.absolute().with_name(f".{out.name}.endoprior.preparing")
+    folder = _work_folder(out)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         got = error.strerror or str(error)
         raise input_error(out, "a path where a folder can be created", got, "Choose another path.") from None
-    with locked(out, folder.with_name(folder.name + ".lock")):
+    with locked(out, work_lock(out)):
         try:
             if _plan_of(folder) != json.loads(json.dumps(plan)):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -51,6 +51,16 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
         except InputError:
             shutil.rmtree(folder, ignore_errors=True)
             raise
+
+
+def work_lock(out: Path) -> Path:
+    """The lock that a process holds while it prepares `out`."""
+    folder = _work_folder(out)
+    return folder.with_name(folder.name + ".lock")
+
+
+def _work_folder(out: Path) -> Path:
+    return out.absolute().with_name(f".{out.name}.endoprior.preparing")
 
 
 def delete_plan(folder: Path) -> None:

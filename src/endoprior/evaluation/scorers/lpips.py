@@ -40,7 +40,7 @@ MIN_SIZE = 32  # Shortest side, px: much below it the deepest features have no p
 SCORES = scores_from("""
     lpips | LPIPS |  | lower | 4 | relative | image | 0 is identical
         The published one: perceptual distance of the masked images by AlexNet; needs its weights.
-    lpips_squeeze | LPIPS (squeeze) |  | lower | 4 | relative | image | -
+    lpips_squeeze | LPIPS (squeeze) |  | lower | 4 | relative | image | - lpips
         The same by SqueezeNet, where its weights are on this machine.
 """)
 

@@ -38,7 +38,7 @@ SCORES = scores_from("""
         Difference of rendered and true optical flow between consecutive frames of the split, by OpenCV's DIS.
     flow_error | flow error | px | lower | 3 | relative | motion | 0 moves as the video does
         The published one: the same by RAFT-large; needs its weights.
-    flow_error_raft_small | flow error (RAFT-small) | px | lower | 3 | relative | motion | -
+    flow_error_raft_small | flow error (RAFT-small) | px | lower | 3 | relative | motion | - flow_error
         The same by RAFT-small, where its weights are on this machine.
     flow_error_dis_adjacent | flow error, adjacent (DIS) | px | lower | 3 | relative | motion | -
         The same by DIS, between all adjacent frames of the video.
