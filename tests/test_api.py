@@ -18,7 +18,7 @@ PACKAGE = Path(endoprior.__file__).parent
 SHORT = """
 import endoprior
 full = endoprior.preset
-endoprior.preset = lambda name: full(name).replace({"gaussians": 200})
+endoprior.preset = lambda name, **changes: full(name, gaussians=200, **changes)
 """
 """Runs before README's block: the same preset with few Gaussians."""
 
@@ -28,7 +28,7 @@ def test_readmes_python_block_runs_as_it_stands(tiny_sequence, tmp_path):
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert '"DATA"' in block and '"RUN"' in block
     checks = 'assert view.color.shape == (40, 48, 3) and "psnr" in scores and len(splats.means)\n'
-    checks += "assert len(losses) == 3 and scene.config.optim.decay_iterations == 3000 and scene.config.seed == 1\n"
+    checks += "assert len(losses) == 3 and scene.config.optim.decay_iterations == 3 and scene.config.seed == 1\n"
     script = tmp_path / "readme.py"
     block = block.replace("iterations=3000", "iterations=3")
     script.write_text(SHORT + block.replace("DATA", str(tiny_sequence)).replace("RUN", str(tmp_path / "run")) + checks)
