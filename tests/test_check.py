@@ -17,7 +17,6 @@ from sequence_edits import change_poses, describe, edit
 from endoprior.check import Facts, Finding, draw_check, find, measure
 from endoprior.check.report import as_json, table
 from endoprior.cli import main
-from endoprior.cli.check import figure_beside
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.found_tools import FrameRow, write_rows
@@ -381,18 +380,6 @@ def test_command_prints_and_writes_figure_and_json(data, capsys):
     assert stored["facts"]["frames"] == FRAMES and len(stored["facts"]["masks"]["tool_fraction"]) == FRAMES
     assert [finding["code"] for finding in stored["findings"]] == ["depth-metres"]
     assert sorted(path.name for path in data.parent.iterdir()) == ["check.json", "data", "new"]
-
-
-def test_two_sequences_of_one_name_have_two_figures(tmp_path, monkeypatch):
-    for name in ("a", "b"):
-        (tmp_path / name / "data").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path / "b")
-    assert figure_beside(Path("../a/data")) == Path("../a/data_check.png")
-    assert figure_beside(Path("data")) == Path("data_check.png")
-    monkeypatch.chdir("data")
-    assert figure_beside(Path(".")) == tmp_path / "b/data_check.png"
-    monkeypatch.setattr("os.access", lambda *_: False)
-    assert figure_beside(tmp_path / "a/data") == Path("data_check.png")
 
 
 @pytest.mark.slow

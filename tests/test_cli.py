@@ -3,12 +3,14 @@
 import json
 import math
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from endoprior.cli import descriptions, main
+from endoprior.cli.check import figure_beside
 from endoprior.cli.view import open_viewable
 
 QUICK = [
@@ -252,3 +254,15 @@ def test_a_damaged_scene_is_named(run, tmp_path, capsys, damage):
     damage(tmp_path / "run" / "scene.safetensors")
     assert main(["eval", str(tmp_path / "run")]) == 2
     assert "scene.safetensors" in complaint(capsys)
+
+
+def test_two_sequences_of_one_name_have_two_figures(tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        (tmp_path / name / "data").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "b")
+    assert figure_beside(Path("../a/data")) == Path("../a/data_check.png")
+    assert figure_beside(Path("data")) == Path("data_check.png")
+    monkeypatch.chdir("data")
+    assert figure_beside(Path(".")) == tmp_path / "b/data_check.png"
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert figure_beside(tmp_path / "a/data") == Path("data_check.png")
