@@ -80,10 +80,29 @@ def test_total_variation_leaves_out_differences_between_two_such_pixels():
     assert losses.total_variation(image, ~everywhere) == losses.total_variation(image)
 
 
+def weighted_scene(seed: int):
+    """The same with weights in [0, 1] in place of masks, some of them 0."""
+    *images, tissue, measured = scene(seed)
+    weight = (torch.rand(tissue.shape, generator=torch.Generator().manual_seed(seed)) * 1.5 - 0.25).clamp(0, 1)
+    return *images, tissue * weight, measured * weight
+
+
+def test_weights_are_those_of_a_weighted_sum_and_a_frame_of_half_weight_counts_half():
+    color, _, target, _, tissue, _ = scene(5)
+    weight = torch.rand(tissue.shape, generator=torch.Generator().manual_seed(6)) * 0.9 + 0.1
+    target = target / 255
+    error = (color - target).abs().sum(-1)
+    wanted = sum(float(error[y, x] * weight[y, x]) for y, x in torch.nonzero(tissue).tolist()) / (3 * int(tissue.sum()))
+    assert losses.color_l1(color, target, tissue * weight).item() == pytest.approx(wanted, rel=1e-5)
+    half = losses.color_l1(color, target, tissue * 0.5)
+    assert half.item() == pytest.approx(0.5 * losses.color_l1(color, target, tissue).item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("made", [scene, weighted_scene])
 @pytest.mark.parametrize("tv_on_tissue", [True, False])
 @pytest.mark.parametrize("seed", range(4))
-def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed, tv_on_tissue):
-    color, depth, *rest = scene(seed)
+def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed, tv_on_tissue, made):
+    color, depth, *rest = made(seed)
     weights = (1.0, 0.7, 0.03, 0.4)
     grads, values = [], []
     for function in (losses.supervised_losses, supervised_losses):
@@ -124,7 +143,13 @@ def test_holes_cost_only_where_tissue_is_hidden():
     alpha = torch.rand(tissue.shape, generator=torch.Generator().manual_seed(4)).requires_grad_()
     hidden = ~tissue & (torch.arange(tissue.shape[1]) < 9)
     frame = SimpleNamespace(
-        rgb_u8=target, inverse_depth=inverse, tissue_mask=tissue, hidden=hidden, measured=measured, num_measured=100
+        rgb_u8=target,
+        inverse_depth=inverse,
+        tissue_mask=tissue,
+        hidden=hidden,
+        measured=measured,
+        num_measured=100,
+        counted=lambda mask: mask,
     )
     out = RenderOutput(color, alpha, depth, torch.zeros(0, 2), torch.zeros(0))
     assert "cover" not in supervised_terms(out, frame, LossConfig(cover_weight=0.0), NUMBA)

@@ -103,7 +103,7 @@ def test_origins_of_an_endonerf_folder(tiny_sequence):
     seq = load_sequence(tiny_sequence)
     assert seq.depth_is_relative and seq.sources == sources
     assert remark_with(tiny_sequence, "scale of its depth is unknown")
-    assert remark_with(tiny_sequence, "1 frames are marked as unexplained, the first is frame 3")
+    assert remark_with(tiny_sequence, "1 of 17 frames have no camera pose")
     edit_json(tiny_sequence / "sequence.json", unexplained_frames=[-1])
     assert_rejected(tiny_sequence, "sequence.json", "unexplained_frames in 0..16, got -1")
 

@@ -93,7 +93,7 @@ def test_description_and_masks(plain):
     assert len(seq) == 6 and seq.frames_per_second == 15 and seq.sources == {"depth": "me"}
     assert seq.frame(0).tissue_mask[:, :6].all() and not seq.frame(0).tissue_mask[:, 6:].any()
     assert seq.frame(1).rgb_u8[0, 0, 0] == 20 and not seq.depth_is_relative
-    assert remark_with(plain, "2 frames are marked as unexplained, the first is frame 2")
+    assert seq.left_out == [1, 2] and remark_with(plain, "2 of 12 frames have no camera pose")
     assert not remark_with(plain, "image widths")
 
 

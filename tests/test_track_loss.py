@@ -18,7 +18,7 @@ from endoprior.training.ops import NUMBA, TORCH
 
 BASIS = BasisConfig(num_bases=6)
 CAMERA = Camera(320, 256, 300.0, 300.0, 160.0, 128.0, np.eye(4))
-FRAME = SimpleNamespace(time=0.4, camera=CAMERA)
+FRAME = SimpleNamespace(time=0.4, camera=CAMERA, reliability=1.0)
 
 
 def at_depth(*depths: float) -> torch.Tensor:

@@ -259,6 +259,8 @@ def _changes(facts: Facts) -> Iterator[Finding]:
     if odd:
         reasons = "blurred, covered or outside the body" + (", damaged, or without a camera pose" if marked else "")
         what = f"{reasons}: {_frames(odd)}"
+        if marked and facts.data.reliability == "used":
+            what += f"; neither trained on nor scored are {_frames(tuple(marked))}"
         yield Finding("unexplained-frames", "warning", what, _skip(facts, odd), odd)
 
 

@@ -142,7 +142,7 @@ class Eval(Command):
     def _finish(self, result: Evaluation, sequence: FrameSequence, out: Path, to_see: str = "") -> None:
         """Write the two files into `out`, and print a table; name frames to look at, and how `to_see` them."""
         file = result.save(out)
-        held_out = f"; {sequence.split_rule}" if sequence.test_phase else ""
+        held_out = f"; {sequence.split_rule}" if sequence.test_phase or sequence.left_out else ""
         say(f"\nscores of the {len(sequence.indices(self.split))} {self.split} frames ({BETTER}{held_out})")
         relative = sequence.depth_is_relative
         for line in (*score_table(result.scores, result.skipped, relative), *protocol_table(result, relative)):

@@ -50,6 +50,9 @@ class DataConfig(Checked):
     """mm per unit of the stored depth; 0 takes what the folder or its format says."""
     test_phase: Annotated[int, Range(0, 7)] = 0
     """Which frame of every eight is held out: frame i if (i - 1) mod 8 is this. 0 is the published split."""
+    reliability: Literal["used", "ignored"] = "used"
+    """`used`: frames without a camera pose are neither trained on nor scored, and blurred, hazy or saturated ones count
+    less. `ignored`: all count alike, as published."""
     eyes: Literal["left", "both"] = "left"
     """Eyes whose pictures are trained on, in turn at random; `both` needs the right ones (docs/scores.md)."""
 

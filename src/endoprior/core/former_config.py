@@ -101,15 +101,17 @@ def _moved(old: dict[str, Any]) -> dict[str, Any]:
             "temporal.pair_weights",
             "pair_weights" if not pairs else "distance" if distance == 0 else "nothing",
         ),
-        "schedule.literal": (  # only presets after publications trained at full resolution throughout
-            "schedule.half_resolution_iterations",
-            old.get("schedule.half_resolution_iterations") == 0,
-        ),
+        "schedule.literal": ("schedule.half_resolution_iterations", _is_literal(old)),
         "windows.longest": ("windows.enabled", old.get("windows.longest", 200) if old.get("windows.enabled") else 0),
     }
     if old.get("deformation.kind") != "hexplane":
         found["optim.basis_lr"] = ("optim.basis_means_lr", old.get("optim.basis_means_lr"))
     return {name: value for name, (former, value) in found.items() if former in old}
+
+
+def _is_literal(stored: Values) -> bool:
+    """Whether a stored config follows a publication: only those trained at full resolution throughout."""
+    return stored.get("schedule.literal", stored.get("schedule.half_resolution_iterations") == 0)
 
 
 def _former_values(new: Values) -> dict[str, Any]:
@@ -165,8 +167,10 @@ def current_form(values: dict[str, Any], fields: Collection[str], own: bool) -> 
     stored = {n: value for n, value in stored.items() if not f"{n}.".startswith(tuple(f"{name}." for name in gone))}
     known = _former_values({})
     old = {name: value for name, value in stored.items() if name in known}
+    if "data.reliability" not in stored and _is_literal(stored):
+        stored["data.reliability"] = "ignored"
     if not (gone or old):
-        return values
+        return _nested(stored)
     new = {name: value for name, value in stored.items() if name not in known} | _moved(stored)
     if new.get("deformation.kind") == "hexplane" and old:
         new.pop("deformation.basis.num_bases", None)  # it has no effect there, and another default

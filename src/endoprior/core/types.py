@@ -59,6 +59,8 @@ class Frame:
     """(H, W) z of the surface, mm; 0 where `depth_valid` is False."""
     depth_valid: NDArray[np.bool_]
     """(H, W) True where depth was measured."""
+    weight: NDArray[np.float32] | None = None
+    """(H, W) in [0, 1]: how far a pixel is to be believed, as M of Eq. (1) where it is tissue; None: 1 everywhere."""
 
     @property
     def rgb(self) -> NDArray[np.float32]:

@@ -49,6 +49,11 @@ KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
     "depth_relative": ("true or false", lambda value: isinstance(value, bool), CORRECT),
     "sources": ("to map names to texts", lambda value: _is_all(value, dict, str), CORRECT),
     "unexplained_frames": ("to be a list of frame numbers", lambda value: _is_all(value, list, int), CORRECT),
+    "frame_weights": (
+        "to be a list of one number in [0, 1] for each frame",
+        lambda value: type(value) is list and all(type(each) in (int, float) and 0 <= each <= 1 for each in value),
+        CORRECT,
+    ),
     "format_version": (
         f"1 to {FORMAT_VERSION}",
         lambda value: type(value) is int and 1 <= value <= FORMAT_VERSION,
@@ -71,14 +76,20 @@ def read_description(path: Path) -> dict[str, Any]:
     return described
 
 
-def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]:
-    """A remark if there are `unexplained_frames`; raises InputError if the sequence does not have one of them."""
+def frame_weights(path: Path, described: dict[str, Any], count: int) -> NDArray[np.float64]:
+    """(T,) how far each frame is to be believed, in [0, 1]: 0 for `unexplained_frames`, else `frame_weights`, or 1.
+
+    Raises:
+        InputError: the sequence does not have one of the unexplained frames, or the weights are not one for each frame.
+    """
     marked = described.get("unexplained_frames", [])
     if outside := [index for index in marked if not 0 <= index < count]:
         raise input_error(path, f"unexplained_frames in 0..{count - 1}", str(outside[0]), CORRECT)
-    return (
-        [f"{path}: {len(marked)} frames are marked as unexplained, the first is frame {min(marked)}"] if marked else []
-    )
+    weights = np.array(described.get("frame_weights", np.ones(count)), np.float64)
+    if len(weights) != count:
+        raise input_error(path, f"frame_weights of {count} frames", str(len(weights)), CORRECT)
+    weights[marked] = 0
+    return weights
 
 
 def intrinsics_of(

@@ -18,7 +18,7 @@ from ..core.config import DataConfig
 from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .description import check_frames, intrinsics_of, read_description
+from .description import frame_weights, intrinsics_of, read_description
 from .files import IMAGE_SUFFIXES, list_files, read_json
 from .formats import Format
 from .frame_files import Kind, files_of_images, one_per_frame
@@ -76,7 +76,7 @@ def load_endonerf(
     kinds = (".png",) if complete else DEPTH_SUFFIXES
     depths = column("depth", "depth", kinds, complete, "; endoprior prepare adds it")
     described = (facts or {}) | read_description(path / "sequence.json")
-    remarks += check_frames(path / "sequence.json", described, len(images))
+    weights = frame_weights(path / "sequence.json", described, len(images))
     unit = cfg.depth_unit_mm or described.get("depth_scale")
     if depths and not unit and not complete:
         remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
@@ -124,6 +124,7 @@ def load_endonerf(
         mask_tool_value=tool_value,
         depth_is_relative=relative,
         sources=described.get("sources") or {},
+        frame_weights=weights[kept],
     )
 
 

@@ -9,7 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from ..core.checks import InputError, input_error, read_ranges
+import numpy as np
+
+from ..core.checks import InputError, input_error, number_ranges, read_ranges
 from ..core.config import DataConfig
 from ..core.shell import command, quoted
 from .endonerf import load_endonerf
@@ -64,8 +66,27 @@ def load_sequence(
             expected = f"two frames within 0 to {len(sequence) - 1}, such as 0-{len(sequence) // 2}"
             raise input_error("data.window", expected, cfg.window, "correct it, or leave it out for all frames.")
         sequence = sequence.part(frames[0], frames[-1] + 1)
+    _use_reliability(sequence, cfg)
     sequence.reading = cfg
     return sequence
+
+
+def _use_reliability(sequence: FrameSequence, cfg: DataConfig) -> None:
+    """Leave out frames of weight 0, unless nothing would be left to train on, or the config says otherwise."""
+    weights = sequence.frame_weights
+    if cfg.reliability == "ignored":
+        sequence.frame_weights = None
+        return
+    sequence.frame_weights = np.ones(len(sequence)) if weights is None else weights
+    if not (left_out := sequence.left_out):
+        return
+    which = f"{len(left_out)} of {len(sequence)} frames have no camera pose, or show another scene"
+    if len(sequence.indices("train")) < 2:
+        sequence.frame_weights = np.ones(len(sequence))
+        sequence.remarks.append(f"{sequence.path}: {which}; all are used, because nothing would be left")
+    else:
+        frames = number_ranges(left_out)
+        sequence.remarks.append(f"{sequence.path}: {which}, and are neither trained on nor scored: {frames}")
 
 
 def find_format(path: Path, cfg: DataConfig) -> str:

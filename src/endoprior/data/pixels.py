@@ -97,6 +97,7 @@ def shrunk(frame: Frame, factor: int) -> Frame:
     with np.errstate(over="ignore"):  # a mean beyond float32 counts as missing
         depth = _blocks(frame.depth, factor).mean((1, 3), dtype=np.float32)
     valid = _blocks(frame.depth_valid, factor).all((1, 3)) & np.isfinite(depth)
+    weight = None if frame.weight is None else _blocks(frame.weight, factor).mean((1, 3), dtype=np.float32)
     return replace(
         frame,
         camera=shrunk_camera(frame.camera, factor),
@@ -104,6 +105,7 @@ def shrunk(frame: Frame, factor: int) -> Frame:
         tissue_mask=_blocks(frame.tissue_mask, factor).all((1, 3)),
         depth=np.where(valid, depth, np.float32(0)),
         depth_valid=valid,
+        weight=weight,
     )
 
 

@@ -14,13 +14,14 @@ from typing import Any, Literal, Protocol, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
+from ..core.checks import input_error, number_ranges
 from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes
 from .contents import demand_same, fingerprint_of, remarks_on, state_of
 from .description import ESTIMATED_POSES, TOOLS_FOUND
+from .reliability import weighted
 from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]
@@ -75,6 +76,9 @@ class FrameSequence:
     """The scale of depth is unknown or assumed, so that lengths are not in mm."""
     sources: dict[str, str] = field(default_factory=dict)
     """Origin of each part, such as {"depth": "stereo"}."""
+    frame_weights: NDArray[np.float64] | None = None
+    """(T,) in [0, 1]: how far each frame is to be believed. One of weight 0, such as without a camera pose, is neither
+    trained on nor scored. None: all alike (`data.reliability ignored`)."""
     reading: DataConfig | None = None
     """How `load_sequence` read it; None for a sequence that was made in another way."""
 
@@ -125,7 +129,11 @@ class FrameSequence:
     def _decoded(self, index: int) -> Frame:
         if not 0 <= index < len(self):
             raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
-        return self._cache.get(index, lambda: self._read_frame(index))
+        return self._cache.get(index, lambda: self._believed(index))
+
+    def _believed(self, index: int) -> Frame:
+        frame = self._read_frame(index)
+        return frame if self.frame_weights is None else weighted(frame, float(self.frame_weights[index]))
 
     def frames(self, split: Split) -> FrameList:
         """The frames of a split, decoded one by one as they are used."""
@@ -138,10 +146,20 @@ class FrameSequence:
         return right_frame(self.frame(index), self.right_eye.image(index), self.right_eye.baseline_mm)
 
     def indices(self, split: Split) -> list[int]:
-        """Ascending frame indices: `test` has (i - 1) % 8 == `test_phase`, `train` the others, `video` all."""
+        """Ascending frame indices: `test` has (i - 1) % 8 == `test_phase`, `train` the others, both without frames of
+        weight 0; `video` all."""
         if split not in ("train", "test", "video"):
             raise ValueError(f"split must be train, test or video; got {split!r}")
-        return [i for i in range(len(self)) if split == "video" or self._is_test(i) == (split == "test")]
+        every = range(len(self))
+        return [i for i in every if split == "video" or (self._is_test(i) == (split == "test") and self._counts(i))]
+
+    def _counts(self, index: int) -> bool:
+        return self.frame_weights is None or self.frame_weights[index] > 0
+
+    @property
+    def left_out(self) -> list[int]:
+        """The frames that are neither trained on nor scored, because their weight is 0."""
+        return [i for i in range(len(self)) if not self._counts(i)]
 
     def _is_test(self, index: int) -> bool:
         return is_test_frame(self._first + index, self._test_phase)
@@ -154,7 +172,8 @@ class FrameSequence:
     @property
     def split_rule(self) -> str:
         """Which frames are held out, in words; i counts from the first frame of the whole sequence."""
-        return f"test iff (i - 1) % {TEST_EVERY} == {self._test_phase}"
+        rule = f"test iff (i - 1) % {TEST_EVERY} == {self._test_phase}"
+        return f"{rule}, without the unreliable frames {number_ranges(self.left_out)}" if self.left_out else rule
 
     def with_test_phase(self, phase: int) -> FrameSequence:
         """This sequence with another frame of every eight held out; InputError if none would be."""
@@ -184,6 +203,7 @@ class FrameSequence:
             _read_frame=lambda index: replace(self._read_frame(start + index), index=index, time=index / num),
             image_names=self.image_names[start:stop],
             mask_files=self.mask_files[start:stop],
+            frame_weights=None if self.frame_weights is None else self.frame_weights[start:stop],
             new_mask_files=[],  # the reader wants those of all frames
             truth=None,
             right_eye=self.right_eye and self.right_eye.part(start, stop),

@@ -7,7 +7,7 @@ folder beside the target, which gets the target's name when it is complete.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -97,13 +97,17 @@ class FrameFiles:
         self._file(name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8", newline="\n")
 
     def finish(
-        self, camera_to_world: NDArray[np.float64] | None = None, unexplained_frames: list[int] | None = None
+        self,
+        camera_to_world: NDArray[np.float64] | None = None,
+        unexplained_frames: Sequence[int] = (),
+        frame_weights: Sequence[float] = (),
     ) -> None:
         """Write `poses_bounds.npy` and `sequence.json`.
 
         Args:
             camera_to_world: (T, 4, 4) mm, OpenCV axes; None for a static camera at the origin.
-            unexplained_frames: frames with a problem that could not be resolved.
+            unexplained_frames: frames with a problem that could not be resolved, such as no camera pose.
+            frame_weights: how far each frame is to be believed, in [0, 1]; empty, or all 1, is not written.
         """
         if self.count == 0:
             raise ValueError("a sequence must have at least one frame; got none")
@@ -114,7 +118,9 @@ class FrameFiles:
         bounds = np.array([depth_bounds(each, meta.depth_scale) for each in stored])
         self.write_array("poses_bounds.npy", pose_table(cameras, meta.height, meta.width, meta.fx, bounds))
         fixed = {"format_version": 1, "depth_unit": "mm", "mask_tool_value": TOOL_VALUE}
-        described = fixed | asdict(meta) | {"unexplained_frames": unexplained_frames or []}
+        described = fixed | asdict(meta) | {"unexplained_frames": [*unexplained_frames]}
+        if min(frame_weights, default=1) < 1:
+            described["frame_weights"] = [round(float(weight), 3) for weight in frame_weights]
         self.write_json("sequence.json", described)
 
     def file(self, folder: str, index: int) -> Path:

@@ -123,6 +123,8 @@ def initial_points(
     def sample(position: int) -> tuple[PointCloud, int]:
         """Points of one frame, and the number of missing points."""
         frame, count = frames[position], shares[position]
+        if frame.weight is not None:  # a frame that is believed less gives fewer points
+            count = round(count * float(frame.weight.max()))
         probability = pixel_probability(frame, cfg, released.prior)
         available = int(np.count_nonzero(probability))
         if cfg.sampler == "pool":
@@ -172,7 +174,10 @@ def pixel_probability(frame: Frame, cfg: InitConfig, released_prior: bool = Fals
         if tissue.any():
             threshold = max(threshold, float(np.percentile(frame.rgb.max(-1)[tissue], ADAPTIVE_PERCENTILE)))
     rho = joint_texture_prior(frame.rgb, tissue, value_threshold=threshold)
-    return np.where(has_surface(frame), sampling_distribution(rho, frame.tissue_mask), 0.0)
+    probability = sampling_distribution(rho, frame.tissue_mask)
+    if frame.weight is not None:
+        probability = probability * frame.weight
+    return np.where(has_surface(frame), probability, 0.0)
 
 
 def sampling_distribution(

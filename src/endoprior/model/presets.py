@@ -40,6 +40,7 @@ def paper() -> Config:
     base = Config()
     return replace(
         base,
+        data=replace(base.data, reliability="ignored"),
         init=replace(
             base.init,
             budget=20_000,

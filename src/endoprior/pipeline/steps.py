@@ -146,16 +146,18 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
 
 def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
     scene = _of_gaussians(load_scene(job.run))
-    frames = _frames_of(job, scene.config).with_poses(scene.cameras).frames("video")
+    sequence = _frames_of(job, scene.config).with_poses(scene.cameras)
+    frames, left_out = sequence.frames("video"), set(sequence.left_out)
     span = depth_span(scene)
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for k, frame in enumerate(frames):
             view = scene.render(frame.time, frame.camera)
             depth = view.depth.cpu().numpy()
+            name = "EndoPrior-GS" + (" (frame not used)" if frame.index in left_out else "")
             shown = {
                 "input": frame.rgb_u8,
-                "EndoPrior-GS": to_u8(view.color.cpu().numpy()),
+                name: to_u8(view.color.cpu().numpy()),
                 "depth": colorize(depth, *span, depth > 0),
             }
             yield tile([label(image, name) for name, image in shown.items()], len(shown))
@@ -169,7 +171,14 @@ def _player(job: SequenceJob, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
     scene = _of_gaussians(load_scene(job.run))
     at_a_time = len(scene) / len(scene.windows)
-    times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
+    left_out = {i / len(scene.cameras) for i in _frames_of(job, scene.config).left_out}
+
+    def shown(most: float) -> list[float]:
+        """Times of at most so many frames, none of which was left out of the training, if any other is there."""
+        every = every_kth_time(len(scene.cameras), most)
+        return [time for time in every if time not in left_out] or every
+
+    times = shown(PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video
     while not job.player.exists():
         try:
@@ -177,10 +186,12 @@ def _player(job: SequenceJob, progress: Progress) -> list[str]:
         except PageTooLarge as error:  # its size is known only when part of it is packed
             if len(times) == 1:
                 raise
-            times = every_kth_time(len(scene.cameras), len(times) * PLAYER_BYTES / error.num_bytes)
-    if len(times) == len(scene.cameras):
-        return []
-    return [f"{len(times)} of {len(scene.cameras)} frames, so that the page stays below {PLAYER_BYTES / 1e6:.0f} MB"]
+            times = shown(len(times) * PLAYER_BYTES / error.num_bytes)
+    skipped = [f"{len(left_out)} frames without a camera pose, or of another scene, are not shown"] if left_out else []
+    if len(times) + len(left_out) == len(scene.cameras):
+        return skipped
+    size = f"{PLAYER_BYTES / 1e6:.0f} MB"
+    return [*skipped, f"{len(times)} of {len(scene.cameras)} frames, so that the page stays below {size}"]
 
 
 STEPS = (

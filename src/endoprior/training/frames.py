@@ -15,9 +15,6 @@ from ..initialization.unseen import convex_hull
 from ..priors import Border, joint_texture_prior
 from ..system.memory import BoundedCache, cache_bytes
 
-TENSORS = ("rgb_u8", "tissue_mask", "hidden", "inverse_depth", "measured")
-"""Fields of a training frame that are copied to a device."""
-
 
 @dataclass(frozen=True)
 class TrainingFrame:
@@ -34,6 +31,16 @@ class TrainingFrame:
     measured: Tensor  # (H, W) bool, True where tissue has a depth
     num_measured: int  # pixels of `measured`
     brightness: float  # mean color over tissue, in [0, 1]; 0 without tissue
+    weight: Tensor | None = None  # (H, W) float32 in [0, 1], how far each pixel is to be believed; None: all alike
+
+    def counted(self, mask: Tensor) -> Tensor:
+        """A mask (H, W) as the loss counts it: bool, or float32 in [0, 1] where pixels have weights."""
+        return mask if self.weight is None else mask * self.weight
+
+    @property
+    def reliability(self) -> float:
+        """How far the frame as a whole is to be believed, in [0, 1]."""
+        return 1.0 if self.weight is None else float(self.weight.max())
 
     @property
     def rgb(self) -> Tensor:
@@ -85,17 +92,19 @@ class TrainingFrames:
         return None
 
     def prior(self, position: int) -> tuple[Tensor, Tensor]:
-        """rho (H, W) in [0, 1] and the tissue mask (H, W) bool, at full resolution."""
+        """rho (H, W) in [0, 1], and (H, W) True on reliable tissue, at full resolution."""
 
         def build() -> Tensor:
             frame = self.sequence.frame(self.indices[position])
-            return torch.from_numpy(joint_texture_prior(frame.rgb, frame.tissue_mask, border=self._border))
+            rho = joint_texture_prior(frame.rgb, frame.tissue_mask, border=self._border)
+            return torch.from_numpy(rho if frame.weight is None else rho * frame.weight)
 
         if self.device.type == "cpu":
             prior = self._priors.get(position, build)
         else:
             prior = self._device_priors.get(position, lambda: _copied(self._priors.get(position, build), self.device))
-        return prior, self.frame(position).tissue_mask
+        frame = self.frame(position)
+        return prior, frame.tissue_mask if frame.weight is None else frame.tissue_mask & (frame.weight > 0.5)
 
 
 def device_bytes(device: torch.device) -> int:
@@ -104,7 +113,8 @@ def device_bytes(device: torch.device) -> int:
 
 
 def _moved(frame: TrainingFrame, device: torch.device) -> TrainingFrame:
-    return replace(frame, **{name: _copied(getattr(frame, name), device) for name in TENSORS})
+    moved = {name: _copied(getattr(frame, name), device) for name in _tensors(frame)}
+    return replace(frame, **moved)
 
 
 def _copied(tensor: Tensor, device: torch.device) -> Tensor:
@@ -126,8 +136,14 @@ def _training_frame(frame: Frame) -> TrainingFrame:
         measured=torch.from_numpy(frame.tissue_mask & usable),
         num_measured=int(np.count_nonzero(frame.tissue_mask & usable)),
         brightness=float(frame.rgb_u8[frame.tissue_mask].mean()) / 255 if frame.tissue_mask.any() else 0.0,
+        weight=None if frame.weight is None else torch.from_numpy(frame.weight),
     )
 
 
 def _frame_bytes(frame: TrainingFrame) -> int:
-    return sum(getattr(frame, name).nbytes for name in TENSORS)
+    return sum(getattr(frame, name).nbytes for name in _tensors(frame))
+
+
+def _tensors(frame: TrainingFrame) -> list[str]:
+    """Names of the fields that are tensors."""
+    return [name for name, value in vars(frame).items() if isinstance(value, Tensor)]

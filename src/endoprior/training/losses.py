@@ -35,8 +35,12 @@ MIN_DEPTH_PIXELS = 10  # a frame with fewer pixels of measured tissue depth gets
 
 
 def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
-    """L_rgb: mean absolute difference of (H, W, 3) colors over tissue pixels (H, W) and channels."""
-    count = (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
+    """L_rgb: mean absolute difference of (H, W, 3) colors over tissue pixels (H, W) and channels.
+
+    Like the other terms, it also takes weights in [0, 1] for a mask; pixels count by their weight, and the sum is
+    divided by the number of pixels of any, so that a frame of low weight counts less.
+    """
+    count = (_num(tissue_mask) * color.shape[-1]).clamp(min=1)
     return ((color - target).abs() * tissue_mask[..., None]).sum() / count
 
 
@@ -47,9 +51,9 @@ def edge_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
     et al. 2016, but of gradients with their signs.
     """
     error = color - target
-    down = (error[1:] - error[:-1]).abs() * (tissue_mask[1:] & tissue_mask[:-1])[..., None]
-    right = (error[:, 1:] - error[:, :-1]).abs() * (tissue_mask[:, 1:] & tissue_mask[:, :-1])[..., None]
-    return (down.sum() + right.sum()) / (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
+    down = (error[1:] - error[:-1]).abs() * (tissue_mask[1:] * tissue_mask[:-1])[..., None]
+    right = (error[:, 1:] - error[:, :-1]).abs() * (tissue_mask[:, 1:] * tissue_mask[:, :-1])[..., None]
+    return (down.sum() + right.sum()) / (_num(tissue_mask) * color.shape[-1]).clamp(min=1)
 
 
 def inverse_depth(depth: Tensor) -> Tensor:
@@ -60,19 +64,24 @@ def inverse_depth(depth: Tensor) -> Tensor:
 
 def inverse_depth_l1(inverse: Tensor, target: Tensor, measured: Tensor) -> Tensor:
     """L_depth: mean absolute difference of inverse depths (H, W) over `measured` tissue pixels, 1 / mm."""
-    return ((inverse - target).abs() * measured).sum() / measured.sum().clamp(min=1)
+    return ((inverse - target).abs() * measured).sum() / _num(measured).clamp(min=1)
+
+
+def _num(counted: Tensor) -> Tensor:
+    """Number of pixels that count, ()."""
+    return (counted > 0).sum()
 
 
 def total_variation(image: Tensor, left_out: Tensor | None = None) -> Tensor:
     """Sum of absolute forward differences of (H, W) or (H, W, C) along both axes, divided by the number of values.
 
-    Differences between two pixels of `left_out` (H, W) do not count.
+    Differences between two pixels of `left_out` (H, W) do not count; where it holds weights, they count the less.
     """
     down, right = (image[1:] - image[:-1]).abs(), (image[:, 1:] - image[:, :-1]).abs()
     if left_out is not None:
         shape = (*left_out.shape, *[1] * (image.ndim - 2))
-        counted = ~left_out.reshape(shape)
-        down, right = down * (counted[1:] | counted[:-1]), right * (counted[:, 1:] | counted[:, :-1])
+        out = left_out.reshape(shape).to(image.dtype)
+        down, right = down * (1 - out[1:] * out[:-1]), right * (1 - out[:, 1:] * out[:, :-1])
     return (down.sum() + right.sum()) / image.numel()
 
 
@@ -91,7 +100,7 @@ def supervised_losses(
     Args:
         color: (H, W, 3) float32. depth: (H, W) float32 mm, 0 where nothing is rendered.
         target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
-        tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared.
+        tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared; or weights in [0, 1].
         weights: factors of the four terms; the depth term is 0 where its factor is.
         tv_on_tissue: whether the total variation counts between two pixels of tissue.
     Returns:
@@ -116,8 +125,8 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, o
         out.depth,
         frame.rgb_u8,
         frame.inverse_depth,
-        frame.tissue_mask,
-        frame.measured,
+        frame.counted(frame.tissue_mask),
+        frame.counted(frame.measured),
         (1.0, depth_weight, cfg.tv_weight, cfg.edge_weight),
         not cfg.cover_weight,
     )
@@ -163,7 +172,8 @@ def track_term(
     cfg: BasisConfig,
     ops: TrainingOps,
 ) -> Tensor:
-    """Mean over the Gaussians of w h(e), (): e is the distance to the track, h the pseudo-Huber penalty, w `followed`.
+    """Mean over the Gaussians of w h(e), times the frame's reliability, (): e is the distance to the track, h the
+    pseudo-Huber penalty, w `followed`.
 
     Args:
         means: (N, 3) canonical centers, mm. offsets: (N, 3) their displacement at the frame, mm; gets the gradient.
@@ -172,7 +182,7 @@ def track_term(
     wanted = ops.model.weighted_sum(tracks.coefficients, basis_weights(frame.time, cfg))[tracks.rows]
     error_px = (offsets - wanted) * _px_per_mm(means.detach() + wanted, frame.camera)[:, None]
     penalty = HUBER_PX * (torch.sqrt((error_px**2).sum(1) + HUBER_PX**2) - HUBER_PX)
-    return (tracks.followed[tracks.rows, position] * penalty).mean()
+    return frame.reliability * (tracks.followed[tracks.rows, position] * penalty).mean()
 
 
 def _px_per_mm(points: Tensor, camera: Camera) -> Tensor:
