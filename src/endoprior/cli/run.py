@@ -20,6 +20,7 @@ from .progress import duration, step_head, step_progress
 from .train import require_gaussians
 
 if TYPE_CHECKING:
+    from ..evaluation.verdict import Verdict
     from ..pipeline import Job, SequenceJob
 
 
@@ -50,7 +51,7 @@ class Run(Command):
 
     def execute(self) -> None:
         """Do every step, with one progress display."""
-        from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of
+        from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of, verdict_of
         from ..runs import kernel_cache
         from ..runs.log import missed_tools_line
 
@@ -77,7 +78,7 @@ class Run(Command):
         except KeyboardInterrupt:
             say("Stopped. To resume, run the same command again.")
             raise
-        say(f"\nDone in {duration(clock.perf_counter() - began)}. Open {job.player} in a browser.")
+        say(f"\n{last_words(verdict_of(job), duration(clock.perf_counter() - began), job.player)}")
         results = {"video": job.rendered_video, "report": job.report, "check": job.figure, "scene": job.run}
         for what, path in results.items():
             say(f"  {what:<8}{path}")
@@ -109,6 +110,14 @@ def _part_words(job: Job) -> str:
     seconds = part.num_frames / part.frames_per_second
     words = f"{job.source}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
     return words if part.is_whole else f"{words} from {part.start:g} s on (--start and --end choose another part)"
+
+
+def last_words(verdict: Verdict | None, took: str, player: Path) -> str:
+    """How a run ended: a model that is wrong is not called done."""
+    if verdict is None:
+        return f"Done in {took}. Open {player} in a browser."
+    head = f"The model is wrong (after {took})" if verdict.word == "wrong" else f"Done in {took}"
+    return f"{head}. Open {player} in a browser.\nVerdict: {verdict}."
 
 
 def resume_words(names: list[str], waiting: list[str]) -> str:
