@@ -58,6 +58,10 @@ def test_a_tool_in_the_nearest_frame_is_filled_from_the_other_side():
     clip.indices, clip.frames_ = [6, 9], [clip[6], clip[9]]
     moved, known = moved_frame(clip, Clip()[7])
     assert known[45:75, 65:95].all() and moved[45:75, 65:95].max() < 0.999
+    clip.indices, clip.frames_ = [6], [clip[6]]
+    alone, shown = moved_frame(clip, Clip()[7])
+    assert not shown[50:70, 70:90].any()
+    np.testing.assert_array_equal(moved[shown], alone[shown])  # the farther frame fills in only
 
 
 def test_the_mean_image_is_over_tissue():
@@ -72,7 +76,7 @@ def test_the_mean_image_is_over_tissue():
 def test_followed_points_triangulate_to_the_plane():
     clip = Clip()
     followed = follow(clip, 0, 12)
-    assert len(followed.start) > 80
+    assert len(followed.start) > 80 and (followed.start % 10 == 5).all()  # centers of the grid's cells
     z, told = triangulated(followed.start, followed.end, clip.camera(0), clip.camera(12))
     assert told.mean() > 0.8
     rays = np.concatenate([(followed.start - (80, 64)) / 150, np.ones((len(z), 1))], 1)
@@ -84,6 +88,8 @@ def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
     camera = Clip(2).camera(0)
     pixels = np.array([[20.0, 30.0], [90.0, 60.0]])
     assert not triangulated(pixels, pixels + 3, camera, camera)[1].any()
+    nearly = replace(camera, world_to_camera=np.linalg.inv(pose(turned(), (0.5, 0, 0))))
+    assert not triangulated(pixels, pixels - (1, 0), camera, nearly)[1].any()  # rays meet at 0.4 degrees
     beside = replace(camera, world_to_camera=np.linalg.inv(pose(turned(), (5.0, 0, 0))))
     end = pixels - (10, 0)
     assert triangulated(pixels, end, camera, beside)[1].all()
