@@ -19,7 +19,9 @@ from endoprior.evaluation.scoring import evaluate
 from endoprior.model.method import METHODS, config_from, method_named, method_of
 from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import load_scene
+from endoprior.model.single_scene import FORMAT
 from endoprior.runs.train import train
+from endoprior.system.arrays_file import save_arrays
 
 PAGE = Path(__file__).parents[1] / "docs" / "add_a_method.md"
 
@@ -103,6 +105,16 @@ def test_a_wrong_loss_is_one_line_with_a_fix_that_its_author_can_follow(tiny_seq
     with registered(tmp_path / "site", change), pytest.raises(InputError, match=message) as caught:
         train(load_sequence(tiny_sequence), preset("own-loss", iterations=4, gaussians=200))
     assert "\n" not in str(caught.value)
+
+
+def test_a_scene_whose_plugin_is_missing_names_what_to_install(tmp_path):
+    about = {"config": {"method": "elsewhere"}}
+    save_arrays(tmp_path / "scene.safetensors", {"x": torch.zeros(1)}, about, FORMAT)
+    with pytest.raises(InputError) as caught:
+        load_scene(tmp_path)
+    said = str(caught.value)
+    assert said.startswith(f"{tmp_path / 'scene.safetensors'}: method: expected one of ") and "got 'elsewhere'" in said
+    assert said.count("Fix: ") == 1 and "Fix: Install the package with this plugin; " in said
 
 
 def test_every_method_can_be_found_and_names_itself():

@@ -21,6 +21,10 @@ OWN_PACKAGE = "endoprior"
 """Its entry points are built in: no other package can have their names."""
 
 
+class MissingPlugin(InputError):
+    """A file needs a plugin that no installed package has. The file itself may be whole."""
+
+
 @dataclass(frozen=True)
 class Plugin:
     """An entry point of an installed package."""
