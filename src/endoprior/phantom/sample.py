@@ -55,6 +55,9 @@ class SampleConfig:
     """px of each camera's image, even."""
     frames_per_second: float = 15.0
 
+    def __post_init__(self) -> None:
+        PhantomConfig(seed=self.seed)  # InputError for one out of range
+
     @property
     def lenses(self) -> tuple[Lens, Lens]:
         """The left and the right lens: of one kind, not quite alike."""
@@ -115,7 +118,8 @@ def sample_frames(cfg: SampleConfig) -> Iterator[NDArray[np.uint8]]:
     """(H, 2 W, 3) RGB, the left camera left: each frame as the video processor puts it out."""
     rays = [rays_of(cfg, right) for right in (0, 1)]
     phantom = phantom_of(cfg, rays)
-    maps = [(phantom.focal * seen + phantom.center - 0.5).astype(np.float32) for seen in rays]
+    places = [(phantom.focal * seen + phantom.center - 0.5).astype(np.float32) for seen in rays]
+    maps = [(np.ascontiguousarray(each[..., 0]), np.ascontiguousarray(each[..., 1])) for each in places]
     light = [vignette(cfg.width, cfg.height) * _stop(cfg, right)[..., None] for right in (0, 1)]
     eyes = STILL, Eye(np.array(_BASELINE_MM), np.eye(3))
     scene, gain = build_scene(phantom), 0.0
@@ -124,9 +128,7 @@ def sample_frames(cfg: SampleConfig) -> Iterator[NDArray[np.uint8]]:
         for right, eye in enumerate(eyes):
             view = render_view(scene, now, eye)
             gain = gain or exposure_gain(view.tissue) * scene.look.exposure
-            bent = cv2.remap(
-                view.image, *maps[right].transpose(2, 0, 1), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-            )
+            bent = cv2.remap(view.image, *maps[right], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             rng = np.random.default_rng([cfg.seed, 9 + right, index])
             image = expose(develop(np.maximum(bent, 0), gain, light[right]), phantom.noise, rng)
             images.append(_labeled(image, index / cfg.frames_per_second))
