@@ -36,7 +36,7 @@ class Sample(Command):
     seed: int = 0
     """Seed of anatomy, motion and noise. The same seed gives the same video."""
 
-    examples = ("OUT",)
+    examples = ("OUT", "OUT --seed 1")
 
     def execute(self) -> None:
         """Write the clip."""
