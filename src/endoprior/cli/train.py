@@ -57,12 +57,14 @@ class Train(Command):
     """Show the scene in a web browser during training. At 127.0.0.1 and --view-port; it slows down training."""
     view_port: int = 8080
     """Port of --view; 0 uses any free port."""
+    tensorboard: bool = False
+    """Also write what TensorBoard shows, made from the log: `tensorboard --logdir RUN`. Needs that package."""
     config: Config = field(default_factory=Config, metadata={"name": ""})
 
     examples = ("DATA RUN", "DATA RUN --iterations 3000 --gaussians 50000", "--resume RUN --iterations 3000")
     basics = (
         "--preset --config --seed --data.first-frames --data.shrink --iterations --resume"
-        " --gaussians --device --view --no-networks --weights-dir"
+        " --gaussians --device --view --tensorboard --no-networks --weights-dir"
     )
     short: ClassVar = {
         f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()
@@ -124,12 +126,14 @@ class Train(Command):
         """Train with this config, write the run folder, score the test split, print the scores."""
         from ..runs.log import missed_tools_line, read_log
         from ..runs.remote import complete_on
+        from ..runs.tensorboard import EventFiles
         from ..runs.train import start_run
         from ..system.ray_cluster import connected
         from ..training.trainer import device_for
 
         out = self.out or self.data
         extends = self.resume and self.iterations == cfg.schedule.total  # 0 if it was not typed
+        events = EventFiles(out) if self.tensorboard else None
         sequence = load_sequence(self.data, cfg.data)
         training = start_run(sequence, cfg, out, resume=self.resume, extends=extends, say=say)
         began = clock.perf_counter()
@@ -140,7 +144,8 @@ class Train(Command):
             else:
                 port = self.view_port if self.view else None
                 with training_progress() as show_progress, live_view(port) as show_scene:
-                    scene = training.complete(show_progress, show_scene, checkpoint_seconds=self.checkpoint_seconds)
+                    observers = [show_progress, show_scene, *([events] if events else [])]
+                    scene = training.complete(*observers, checkpoint_seconds=self.checkpoint_seconds)
         except KeyboardInterrupt:
             say(f"Stopped; the state is saved in {out}. To resume, run the same command with --resume.")
             raise
@@ -153,7 +158,9 @@ class Train(Command):
         scene = scene.to(device_for(cfg.render.backend))  # score on the training device
         try:
             scoring = Eval(out, self.data, networks=self.networks, weights_dir=self.weights_dir)
-            scoring.score_run(scene, out, extra)
+            scores = scoring.score_run(scene, out, extra).scores
+            if events:
+                events.finish(scores, cfg.schedule.total)
             if line := missed_tools_line(out, self.data):
                 say(line)
         except KeyboardInterrupt:
