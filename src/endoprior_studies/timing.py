@@ -2,7 +2,7 @@
 
 One cell of each method and size of frames runs with the parts of its schedule cut to `MEASURED` iterations. The other
 cells of the method take as long for an iteration, and as long beside the iterations for each frame. Gaussians do not
-grow in so short a training, so that the time is a lower bound.
+grow in so short a training, so that on an equally busy machine the time is a lower bound.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Estimate:
                 f"time on this machine: {total:.1f} h or more for {count} trainings, {at_once} at a time ({each})"
             )
             lines.append(
-                f"disk: about {self.size / 1e9:.1f} GB. Measured before Gaussians grow; expect up to twice the time"
+                f"disk: about {self.size / 1e9:.1f} GB. Measured as busy as it is now, and before Gaussians grow, which takes longer"
             )
         if self.unmeasured:
             lines.append(f"{self.unmeasured} trainings are too short to be measured, or have no schedule that is known")
