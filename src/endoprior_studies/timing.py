@@ -123,9 +123,8 @@ class Estimate:
             lines.append(
                 f"time on this machine: {total:.1f} h or more for {count} trainings, {at_once} at a time ({each})"
             )
-            lines.append(
-                f"disk: about {self.size / 1e9:.1f} GB. Measured as busy as it is now, and before Gaussians grow, which takes longer"
-            )
+            lines.append("measured on the machine as busy as it is now, and before Gaussians grow, which takes longer")
+            lines.append(f"disk: about {self.size / 1e9:.1f} GB")
         if self.unmeasured:
             lines.append(f"{self.unmeasured} trainings are too short to be measured, or have no schedule that is known")
         return lines
