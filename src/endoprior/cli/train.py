@@ -14,7 +14,7 @@ from ..core.config_io import SHORT_NAMES
 from ..core.shell import command
 from ..data import load_sequence
 from ..model.method import method_of
-from ..model.presets import preset, preset_names
+from ..model.presets import preset, preset_line, preset_names
 from ..runs.folder import config_of_run, read_config, sequence_of_run
 from ..runs.progress import training_progress
 from ..system.console import say
@@ -32,7 +32,7 @@ class Train(Command):
     """Sequence folder: of `endoprior prepare` or a dataset. To resume a run, `--resume RUN` alone is enough."""
     out: Path | None = field(default=None, metadata={"place": "OUT"})
     """Run folder to write."""
-    preset: str = field(default="default", metadata={"choices": preset_names()})
+    preset: str = field(default="default", metadata={"choices": preset_names(), "metavar": "NAME"})
     """Method: a preset of the config."""
     config_file: Path | None = field(default=None, metadata={"name": "config", "metavar": "FILE"})
     """Config of another run (config.json), or YAML with some fields. It overrides the preset; options override it."""
@@ -69,6 +69,11 @@ class Train(Command):
     short: ClassVar = {
         f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()
     }
+
+    @classmethod
+    def more_help(cls) -> list[str]:
+        """What each preset is."""
+        return ["presets:", *(f"  {name:<19}{preset_line(name)}" for name in preset_names())]
 
     @classmethod
     def from_words(cls, argv: Sequence[str]) -> Self:
