@@ -51,6 +51,7 @@ bench: $(VENV)/.installed
 figures: $(VENV)/.test-installed browser
 	$(BIN)/python bench/figures.py figures
 	$(BIN)/python bench/method_figures.py figures
+	$(BIN)/python bench/symptom_figures.py figures
 
 # The site, in build/docs/html; it needs no network. Warnings, such as a link that leads nowhere, are errors.
 docs: $(VENV)/.docs-installed
