@@ -52,6 +52,24 @@ def test_text_is_detected_at_its_position(box):
     assert width * height < 4 * (right - left) * (bottom - top)
 
 
+def test_a_clock_is_found_though_its_digits_change():
+    images = [
+        written([frame], f"12:0{i % 5}:{37 * i % 60:02d}", (60, 100), box=True)[0] for i, frame in enumerate(moving())
+    ]
+    (x, y, width, height), *more = find_static_overlays(images)
+    assert x <= 64 and x + width >= 140 and y <= 90 and y + height >= 98 and not more
+
+
+def test_static_highlights_are_no_label():
+    glare = np.zeros((HEIGHT, WIDTH), np.float32)
+    for x, y in ((100, 100), (109, 103), (118, 101), (127, 105)):
+        cv2.ellipse(glare, (x, y), (5, 3), 30, 0, 360, 300, -1)
+    glare = cv2.GaussianBlur(glare, (0, 0), 1.2)[..., None]
+    shown = np.where(glare > 8, 90 + 0.6 * glare, 0)
+    images = [np.clip(np.where(glare > 8, shown, frame), 0, 255).astype(np.uint8) for frame in moving()]
+    assert find_static_overlays(images) == []
+
+
 def test_two_labels_are_sorted_from_top_to_bottom():
     first, second = find_static_overlays(written(written(moving()), "CAM2", (140, 30)))
     assert first[1] < second[1] and first[0] > second[0]

@@ -57,6 +57,16 @@ def test_the_layout_is_detected():
     assert find_layout([left], None, False, "v") == "mono" and find_layout([left], None, True, "v") == "two-files"
 
 
+def test_halves_with_the_same_shading_are_one_camera():
+    """A tube is dark in its middle, and a fade-in scales it; its halves differ only in their details."""
+    x = np.abs(np.linspace(-1, 1, 192))[None, :, None]
+    bands = (np.abs(np.mod(np.linspace(0, 2, 128), 1) - 0.5) * 2)[:, None, None]
+    rng = np.random.default_rng(0)
+    tube = (40 + 80 * x + 80 * bands + rng.normal(0, 4, (128, 192, 3))).clip(0, 255)
+    fading = [(tube * share).astype(np.uint8) for share in (0.05, 0.3, 1, 1)]
+    assert find_layout(fading, None, False, "v") == "mono"
+
+
 def test_an_unknown_layout_is_an_error():
     left, right = pair()
     with pytest.raises(InputError, match=r"v: expected two cameras in each frame, got 96x64 px.*--layout"):

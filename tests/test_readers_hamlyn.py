@@ -13,7 +13,7 @@ from sequence_edits import change_poses, write
 
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.footage.border import black_margin
+from endoprior.footage.outside import find_outside
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
 CROP = 4
@@ -176,7 +176,7 @@ def test_vignetting_is_no_margin():
     y, x = np.mgrid[-1:1:48j, -1:1:64j]
     falloff = np.clip(1 - 0.5 * (x * x + y * y), 0.02, None)[..., None]
     images = [(150 * falloff + i % 3 + np.zeros(3)).astype(np.uint8) for i in range(10)]
-    assert images[0].min() < 12 and not black_margin(images).any()
+    assert images[0].min() < 12 and not find_outside(images).mask.any()
 
 
 FORPLANE_BAD = {

@@ -25,7 +25,7 @@ from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
-from ..footage.overlays import find_static_overlays
+from ..footage.overlays import find_static_overlays, without_strokes
 from ..footage.polarity import Polarity, mask_polarity
 from ..footage.pose_fit import PoseFit, View, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
@@ -83,7 +83,9 @@ class BorderFacts:
     strips: Strips  # static or black strips at the sides, px
     strips_as_tissue: float  # share of the strips' pixels that are marked as tissue; 0 without strips
     circle: Circle | None  # round border of the endoscope image
-    outside_as_tissue: float  # share of the pixels outside the circle that are marked as tissue; 0 without a circle
+    outside: Mask  # (H, W) True beyond the round border, or one of any other shape
+    outside_as_tissue: float  # share of these pixels that are marked as tissue; 0 without any
+    sharpness: float  # share of the outline of a border that is no circle which is sharp; 1 without one
     overlays: tuple[tuple[int, int, int, int], ...]
     """x, y, width, height of burned-in labels that are marked as tissue, px."""
     masked: Mask
@@ -171,7 +173,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
     samples = [sequence.frame(int(i)) for i in spread(count, SAMPLES)]
     images = [frame.rgb_u8 for frame in samples]
     polarity = mask_polarity([~frame.tissue_mask for frame in samples], images)
-    outline = find_outline(images)
+    outline = find_outline(without_strokes(images))
     masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
     view = max(int((~masked).sum()), 1)
     tool_fraction = np.array([1 - frame.tissue_mask.sum() / view for frame in frames])
@@ -255,7 +257,9 @@ def _border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: lis
         outline.strips,
         _mean(tissue[outline.in_strip]),
         outline.circle,
+        outline.outside,
         _mean(tissue[outline.outside]),
+        outline.other.sharpness,
         tuple(filter(is_label, find_static_overlays(images))),
         masked,
     )

@@ -13,13 +13,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.patches import Circle, Patch, Rectangle
+from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit, project
 from ..core.ranges import spread
 from ..core.types import Frame
 from ..data import FrameSequence
+from ..footage.overlays import find_strokes
 from ..footage.units import FAR_MM, NEAR_MM
 from ..system.atomic import whole_file
 from ..visualization.image_tools import colorize
@@ -105,10 +106,16 @@ def _draw_unsure(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
 
 
 def _outlined(frame: Frame, border: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The frame with tools tinted and outlined in red; a masked border (H, W) is no tool."""
+    """The frame with tools tinted and outlined in red, and masked drawings (boxes, text) in yellow; a masked border
+    (H, W) is no tool.
+    """
     image = frame.rgb_u8.copy()
-    tool = ~frame.tissue_mask & ~border
-    red = np.array([int(TOOL_COLOR[i : i + 2], 16) for i in (1, 3, 5)], np.float32)
+    drawn = ~frame.tissue_mask & find_strokes(image)
+    tool = ~frame.tissue_mask & ~border & ~drawn
+    red, yellow = (
+        np.array([int(of[i : i + 2], 16) for i in (1, 3, 5)], np.float32) for of in (TOOL_COLOR, BORDER_COLOR)
+    )
+    image[drawn] = yellow
     image[tool] = (0.72 * image[tool] + 0.28 * red).astype(np.uint8)
     outlines, _ = cv2.findContours(tool.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(image, outlines, -1, red.tolist(), max(1, image.shape[1] // 300))
@@ -116,7 +123,7 @@ def _outlined(frame: Frame, border: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 
 def _draw_border(axis: Axes, facts: Facts) -> None:
-    """Strips, round border and labels, in yellow; dotted where the masks already exclude them."""
+    """Strips, border and labels, in yellow; dotted where the masks already exclude them."""
     border, strips, width, height = facts.border, facts.border.strips, facts.camera.width, facts.camera.height
     sides = (
         (0, 0, width, strips.top),
@@ -124,12 +131,14 @@ def _draw_border(axis: Axes, facts: Facts) -> None:
         (0, 0, strips.left, height),
         (width - strips.right, 0, strips.right, height),
     )
-    open_strips, open_circle = (s > SEEN_AS_TISSUE for s in (border.strips_as_tissue, border.outside_as_tissue))
+    open_strips, open_outside = (s > SEEN_AS_TISSUE for s in (border.strips_as_tissue, border.outside_as_tissue))
     patches: list[tuple[Patch, bool]] = [
         (Rectangle((x, y), across, down, hatch="//"), open_strips) for x, y, across, down in sides if across and down
     ]
-    if circle := border.circle:
-        patches.append((Circle((circle.center_x, circle.center_y), circle.radius), open_circle))
+    if border.outside.any():
+        style = "solid" if open_outside else "dotted"
+        edges = {"colors": BORDER_COLOR, "linewidths": 1.2, "linestyles": style}
+        axis.contour(np.arange(width) + 0.5, np.arange(height) + 0.5, border.outside, [0.5], **edges)
     patches += [(Rectangle((x, y), across, down), True) for x, y, across, down in border.overlays]
     for patch, is_open in patches:
         patch.set(fill=False, edgecolor=BORDER_COLOR, linewidth=1.2, linestyle="-" if is_open else ":")

@@ -184,8 +184,9 @@ def _border(facts: Facts) -> Iterator[Finding]:
         what = f"a bar or console strip of {sides} counts as tissue"
         fix = f"run `prepare` with `--crop X,Y,WIDTH,HEIGHT`, without it, or {in_masks}"
         yield Finding("console-strip", "warning", what, fix)
-    if border.circle and border.outside_as_tissue > SEEN_AS_TISSUE:
-        what = f"the image is round (radius {border.circle.radius:.0f} px) and its outside counts as tissue"
+    if border.outside_as_tissue > SEEN_AS_TISSUE:
+        shape = f"is round (radius {border.circle.radius:.0f} px)" if border.circle else "has a border"
+        what = f"the image {shape} and its outside counts as tissue"
         yield Finding("round-border", "warning", what, f"run `prepare` with `--border auto`, or {in_masks}")
     if border.overlays:
         boxes = ", ".join(f"{width}x{height} px at {x}, {y}" for x, y, width, height in border.overlays[:3])

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.checks import quotation
 from ..core.geometry import length_unit
+from ..footage.outside import CERTAIN
 from .facts import Facts
 from .findings import Finding
 
@@ -89,6 +90,9 @@ def _border_words(facts: Facts) -> str:
     strips, circle = facts.border.strips, facts.border.circle
     words = [f"strip of {size} px at the {name}" for name, size in vars(strips).items() if size]
     words += [f"round, radius {circle.radius:.0f} px"] if circle else []
+    if not circle and facts.border.outside.any():
+        unsure = ", uncertain" if facts.border.sharpness < CERTAIN else ""
+        words.append(f"{facts.border.outside.mean():.1%} of a frame is outside{unsure}")
     masked = float(facts.border.masked.mean())
     words += [f"{masked:.1%} of pixels masked"] if masked else []
     return ", ".join(words) or "none"

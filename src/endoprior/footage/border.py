@@ -1,5 +1,5 @@
-"""Where the endoscope image ends: straight and round borders of one clip together, and black parts. Images are K
-samples of the clip, (H, W, 3), at different times.
+"""Where the endoscope image ends: strips at the sides, a circle, and borders of any other shape. Images are K samples
+of the clip, (H, W, 3), at different times.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask, components, distance_inside, grown, regions_where, square
-from .dark_outline import Circle, Darkness, blurred, brightness, find_darkness, reduced
+from .components import Image, Mask
+from .dark_outline import Circle, brightness
+from .outside import Outside, find_outside
 from .round_border import find_circle
 
-__all__ = ["Circle", "Outline", "Strips", "black_margin", "find_circle", "find_outline", "find_strips", "masked_border"]
+__all__ = ["Circle", "Outline", "Outside", "Strips", "find_circle", "find_outline", "find_strips", "masked_border"]
 
 BLACK_LEVEL = 28  # Levels 0..255 below this are black, including limited-range video with coding noise
 MIN_STRIP_PX = 3  # Thinner strips are ignored; they can be coding noise
@@ -26,14 +27,6 @@ EDGE_SHARE, EDGE_STEP = 0.55, 12
 """Share of a strip's edge with a brightness step, and its least levels: unlike that of a shadow, it is straight."""
 FADING, MOST_FADING_PX = 0.8, 3
 """So many rows next to a strip belong to it if they have less than this share of the level two rows further inside."""
-MARGIN_LEVEL, MARGIN_AREA = 20, 0.001
-"""The margin of a rectification is darker than this level, and covers at least this share of the image."""
-SHARP_PX = 4  # Beside a black part the image begins within this length, px; dark tissue becomes brighter gradually
-MARGIN_SHARP, ARC_SHARP = 0.3, 0.6
-"""Share of the outline on which it does: of a margin, and of a black part of a circle."""
-MARGIN_GROW_PX, ARC_GROW_PX = 2, 3  # So much more is left out: interpolation and coding darken or blur the outline
-ARC_LENGTH = 3  # A black part of a circle is so many times longer along the border than deep; a dark tool is not
-FRAME_PX = 3  # Width of the black frame around the image while a margin is searched
 
 
 @dataclass(frozen=True)
@@ -56,20 +49,25 @@ class Outline:
     strips: Strips
     circle: Circle | None
     in_strip: Mask  # (H, W) True in the strips
-    outside: Mask  # (H, W) True outside of the circle, on its rim, and on black parts inside of it
+    other: Outside  # what else is outside: a border that is no circle, or black parts inside of the circle
+    outside: Mask  # (H, W) True outside of the circle, on its rim, and on `other`
+
+    @property
+    def found(self) -> bool:
+        """Whether the endoscope image ends before the frame does."""
+        return bool(self.strips or self.outside.any())
 
 
 def find_outline(images: Sequence[Image]) -> Outline:
-    """Detect strips and a round border in (H, W, 3) sample images."""
+    """Detect strips and a border of any shape in (H, W, 3) sample images."""
     height, width = images[0].shape[:2]
     circle = find_circle(images)
     strips = find_strips(images, circle)
     in_strip = np.ones((height, width), bool)
     in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
-    outside = np.zeros((height, width), bool)
-    if circle:
-        outside = ~circle.mask(width, height, circle.margin_px) | _black_arcs(images, circle)
-    return Outline(strips, circle, in_strip, outside)
+    inside = circle.mask(width, height, circle.margin_px) if circle else np.ones((height, width), bool)
+    other = find_outside(images, inside & ~in_strip)
+    return Outline(strips, circle, in_strip, other, ~inside | other.mask)
 
 
 def masked_border(outline: Outline, images: Sequence[Image], tissue_masks: Iterable[Mask]) -> Mask:
@@ -127,54 +125,3 @@ def _strip_on_top(maps: list[NDArray], central_change: float) -> int:
     while fading < min(MOST_FADING_PX, len(level) - 3) and level[fading] < FADING * level[fading + 2]:
         fading += 1
     return rows + fading
-
-
-def black_margin(images: Sequence[Image]) -> Mask:
-    """(H, W) True on the black margin of a rectification: without color in all images, at the edge, sharp."""
-    # A black frame around the image joins the regions of its sides, and keeps narrow ones.
-    grays = [blurred(np.pad(brightness(image), FRAME_PX)) for image in images]
-    inner = (slice(FRAME_PX, -FRAME_PX),) * 2
-    none = np.zeros(images[0].shape[:2], bool)
-    darkness = find_darkness([gray[inner] for gray in grays])
-    if darkness is None or darkness.level >= MARGIN_LEVEL:
-        return none
-    black, lit = _black_and_lit(np.maximum.reduce(grays), darkness)
-    regions, _ = components(black, 4)
-    margin = regions == regions[0, 0]
-    if margin[inner].mean() < MARGIN_AREA:
-        return none
-    outline = (grown(margin, square(1)) & ~margin)[inner]
-    if not outline.any() or lit[inner][outline].mean() < MARGIN_SHARP:
-        return none
-    return grown(margin[inner], square(MARGIN_GROW_PX))
-
-
-def _black_arcs(images: Sequence[Image], circle: Circle) -> Mask:
-    """(H, W) True on black parts of the circle, where the picture ends before it does: black in all images, they begin
-    at the border or the image's edge, and end sharply.
-    """
-    grays = [blurred(brightness(image)) for image in images]
-    height, width = grays[0].shape
-    darkness = find_darkness(reduced(grays)[0])
-    if darkness is None:
-        return np.zeros((height, width), bool)
-    inside = circle.mask(width, height, circle.margin_px)
-    black, lit = _black_and_lit(np.maximum.reduce(grays), darkness, inside)
-    regions, boxes = components(black, 4)
-    distance = distance_inside(np.pad(inside, 1))[1:-1, 1:-1]  # the edge of the image cuts the circle
-    # The outline is where a black pixel has one beside it that is not; near the border that says nothing.
-    outer = black & grown(~black, square(1)) & (distance > SHARP_PX)
-    depth = np.zeros(len(boxes), np.float32)
-    np.maximum.at(depth, regions[black], distance[black])
-    contact, outline, sharp = (
-        np.bincount(regions[where], minlength=len(boxes)) for where in (black & (distance < 1.5), outer, outer & lit)
-    )
-    chosen = (contact > ARC_LENGTH * depth) & (outline > 0) & (sharp >= ARC_SHARP * outline)
-    return grown(regions_where(chosen, regions), square(ARC_GROW_PX)) & inside
-
-
-def _black_and_lit(brightest: Image, darkness: Darkness, inside: Mask | bool = True) -> tuple[Mask, Mask]:
-    """(H, W) True on black pixels `inside`, without specks; (H, W) True within `SHARP_PX` of lit ones."""
-    black = ((brightest <= darkness.level + darkness.step) & inside).astype(np.uint8)
-    lit = cv2.dilate(brightest, square(SHARP_PX)) > darkness.level + 4 * darkness.step
-    return cv2.morphologyEx(black, cv2.MORPH_OPEN, square(1)) > 0, lit

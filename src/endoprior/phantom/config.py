@@ -19,6 +19,7 @@ Instruments = Literal[
     "graspers", "gray_blue", "black", "white_plastic", "steel", "gold", "green", "blue", "mixed"
 ]  # fmt: skip
 Tissue = Literal["bowel", "pale", "fat", "purple", "liver", "warm", "smoke", "blood"]
+Border = Literal["none", "octagon", "oval", "rounded"]
 
 NARROW_PULL_MM = 15.0
 """Up to this pull, mm, the moved neighborhood keeps its size; beyond, it grows in proportion, or tissue would fold."""
@@ -48,6 +49,10 @@ class PhantomConfig:
     """Kind of tissue and view: its color, vessels and gloss; `warm` light; `smoke` that comes and goes; `blood`."""
     camera: Literal["still", "inspect"] = "still"
     """`inspect`: the camera moves; every 300 frames or so it pans, turns, rolls, retreats, approaches and returns."""
+    border: Border = "none"
+    """Black border around the image; `truth/border.npy` says where."""
+    overlay: bool = False
+    """Draw the moving red box of a detection with text into most frames; `truth/overlay/` says where."""
     stereo: bool = False
     """Also write the images of the right camera (`right/`) and `calibration.json`."""
     side_views: bool = True
@@ -96,7 +101,8 @@ class PhantomConfig:
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
-        for name, known in (("instruments", get_args(Instruments)), ("tissue", get_args(Tissue))):
+        choices = {"instruments": Instruments, "tissue": Tissue, "border": Border}
+        for name, known in ((name, get_args(kinds)) for name, kinds in choices.items()):
             if getattr(self, name) not in known:
                 raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
         moves = self.camera == "inspect"

@@ -15,6 +15,7 @@ from .camera import STILL, Eye
 from .config import PhantomConfig
 from .scene import Moment, Scene, build_scene
 from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
+from .surround import border, overlay, surrounded
 from .texture import smooth_patches
 from .views import pixel_hits, render_view, shown_elsewhere, side_eyes, side_view, visible_points
 
@@ -74,6 +75,8 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
     - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, and the density of smoke
       in each frame, 0..1; `truth/tissue` shows the smoke too, the side cameras do not;
+    - with `cfg.border` `truth/border.npy`, (H, W) bool, True outside; with `cfg.overlay` `truth/overlay/*.npy`, True
+      on the drawing;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
 
     Args:
@@ -85,7 +88,9 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     with new_sequence(out, _meta(cfg)) as writer:
         scene = build_scene(cfg)
         tracked = choose_tracks(scene)
-        lens = vignette(cfg.width, cfg.height)
+        lens, outside = vignette(cfg.width, cfg.height), border(cfg)
+        if cfg.border != "none":
+            writer.write_array("truth/border.npy", outside)
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
         points, visible, gain, sides = [], [], 0.0, {}
@@ -100,10 +105,13 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             rng = np.random.default_rng([cfg.seed, 6, index])
             image = expose(develop(view.image, gain, lens), cfg.noise, rng)
             mask = cv2.dilate((view.tool_share > 0).astype(np.uint8), rim) > 0
-            right = None
+            right, drawn = None, overlay(cfg, index)
+            if cfg.overlay:
+                writer.write_array(f"truth/overlay/{index:06d}.npy", drawn)
             if cfg.stereo:
                 other = render_view(scene, now, Eye.moved(cfg.baseline_mm))
                 right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
+                right = surrounded(right, outside, drawn)
             writer.write_image("truth/tissue", np.round(develop(view.tissue, gain, lens)).astype(np.uint8))
             writer.write_array(f"truth/depth/{index:06d}.npy", z)
             seen = visible_points(now.vertices, z, mask, cfg)
@@ -117,7 +125,9 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
                     writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
             else:
                 ever_seen |= seen
-            writer.add(image, mask, stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng), right)
+            depth = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
+            depth[outside] = 0
+            writer.add(surrounded(image, outside, drawn), mask | outside | drawn, depth, right)
             if progress is not None:
                 progress(index + 1, cfg.frames)
         for index, packed in behind_tools.items():  # what is seen later is known only now

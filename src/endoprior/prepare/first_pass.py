@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..core.shell import quoted
 from ..data.reading import kind_of
-from ..footage.border import Circle, Strips, find_outline
+from ..footage.border import Circle, Outside, Strips, find_outline
 from ..footage.changes import are_combed
-from ..footage.overlays import find_static_overlays
+from ..footage.outside import CERTAIN as SHARP
+from ..footage.outside import beyond
+from ..footage.overlays import find_static_overlays, find_strokes, without_strokes
 from ..footage.round_border import CERTAIN
 from .calibration import fitted
 from .config import Layout, PrepareConfig, Rectangle, parse_rectangle
@@ -59,6 +61,15 @@ class FirstPass:
     damaged: frozenset[int] = frozenset()  # those of `indices` whose images are damaged
     stored_size: tuple[int, int] | None = None  # (width, height) of one camera's image of pixels that are not square
     image_names: list[str] = field(default_factory=list)  # of a source folder, without suffixes; empty for a video
+    hides: bool = False  # whether drawings in single frames are searched
+    moving_border: float | None = None  # level of a border that moves: see `footage.outside.beyond`
+
+    def hidden(self, rgb_u8: Image) -> Mask:
+        """(H, W) True where a frame (H, W, 3) shows nothing of the body, and others do: drawings, or a border."""
+        found = find_strokes(rgb_u8) if self.hides else np.zeros(rgb_u8.shape[:2], bool)
+        if self.moving_border is not None:
+            found |= beyond(rgb_u8, self.moving_border, self.geometry.inside)
+        return found
 
     def frame_of(self, read: Callable[[tuple[int, int]], NDArray]) -> NDArray:
         """The frame (H, W) of a file that has the size of the source images, of the frames, or of the stored pixels.
@@ -108,11 +119,11 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
         full = size[0] * across, size[1] * down
         calibration, words = fitted(calibration, full, name, squeezed=cfg.squeezed_eyes)
         notes += [*calibration.notes, *words]
-    strips = circle = outside = None
+    strips = circle = outside = other = None
     labels: list[Rectangle] = []
     if cfg.border == "auto":
-        outline = find_outline(lefts)
-        circle, strips, outside = outline.circle, outline.strips or None, outline.outside
+        outline = find_outline(without_strokes(lefts))
+        circle, strips, outside, other = outline.circle, outline.strips or None, outline.outside, outline.other
         labels = find_static_overlays([_without(image, strips) for image in lefts])
     blank = [parse_rectangle(text, "--blank") for text in cfg.blank]
     for rectangle in blank:
@@ -123,14 +134,18 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
         crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None, blank=[*labels, *blank],
         strips=strips, circle=circle, outside=outside,
     )  # fmt: skip
-    notes += border_notes(strips, circle, labels, float(1 - geometry.inside.mean()))
+    notes += border_notes(strips, circle, labels, float(1 - geometry.inside.mean()), other)
+    if cfg.border == "auto" and (drawn := np.mean([find_strokes(image).any() for image in lefts])):
+        notes.append(f"boxes or text are drawn into {drawn:.0%} of the samples: masked in each frame, as no tissue")
     if calibration is None:
         notes.append(
             f"no calibration; a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
             f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
         )
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
-    return FirstPass(indices, samples, geometry, notes, video_notes, damaged, clip.stored_size, names)
+    level = other.level if other and other.moves else None
+    hides = cfg.border == "auto"
+    return FirstPass(indices, samples, geometry, notes, video_notes, damaged, clip.stored_size, names, hides, level)
 
 
 def _look_through(
@@ -195,7 +210,9 @@ def _comb_note(clip: Clip) -> str:
     return f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"
 
 
-def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:
+def border_notes(
+    strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float, other: Outside | None = None
+) -> list[str]:
     """Notes on detected borders and labels. Args: outside: share of the pixels of a frame that show nothing."""
     notes = []
     if strips:
@@ -210,6 +227,16 @@ def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rect
             notes.append(
                 f"the round border is uncertain: {circle.agreement:.0%} of it agree with the images. If it is wrong, "
                 "use --border keep, with --crop and --field-of-view-degrees."
+            )
+    if other and other.mask.any():
+        moving = ", and it moves: what it hides is masked in each frame" if other.moves else ""
+        notes.append(f"the image has a border: {other.mask.mean():.1%} of the source is outside and masked{moving}.")
+        if other.images > 1:
+            notes.append(f"a frame shows {other.images} images; the largest is used. To use another one: --crop.")
+        if other.sharpness < SHARP:
+            notes.append(
+                f"the border is uncertain: {other.sharpness:.0%} of its outline is sharp. See check.png; if it is "
+                "wrong, use --border keep, with --crop."
             )
     notes += [f"a burned-in label was painted over: {x},{y},{w},{h}" for x, y, w, h in labels]
     return notes

@@ -82,7 +82,8 @@ def make_geometry(
         name: of the calibration, for error messages.
         stretch: factors (across, down) that undo the squeezing of an image.
         crop, blank, strips, circle: parts to keep and parts to paint over. The rim of the circle is left out.
-        outside: (h, w) of the source, True on more that shows no tissue, such as black arcs inside of the circle.
+        outside: (h, w) of the source, True on what else is beyond the border, of any shape. Without a circle, the field
+            of view spans the rest.
     Raises:
         InputError: the crop leaves too little, or the calibration does not fit.
     """
@@ -96,7 +97,8 @@ def make_geometry(
     maps: Pair = None, None
     if calibration is None:
         # A round border of a squeezed image is no circle.
-        matrix = _assumed(*full, circle if full == size else None, field_of_view_degrees)
+        seen = _bounding_box(~outside) if full == size and outside is not None and outside.any() else (0, 0, *full)
+        matrix = _assumed(seen, circle if full == size else None, field_of_view_degrees)
     else:
         baseline = check_pair(calibration, name) if stereo else None
         matrix, turn, maps = rectify(calibration, full, name, stereo=stereo)
@@ -147,9 +149,10 @@ def _shrink(image: NDArray, size: Size) -> NDArray:
     return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> NDArray:
-    """K of a camera with an assumed field of view."""
-    extent, x, y = width / 2, width / 2, height / 2
+def _assumed(seen: Rectangle, circle: Circle | None, degrees: float) -> NDArray:
+    """K of a camera with an assumed field of view, across a circle or the part that is seen."""
+    left, top, width, height = seen
+    extent, x, y = width / 2, left + width / 2, top + height / 2
     if circle is not None:
         extent, x, y = circle.radius, circle.center_x, circle.center_y
     focal = extent / math.tan(math.radians(degrees / 2))

@@ -60,6 +60,7 @@ class FrameMethods:
     measure: Measure | None  # depth that needs no mask: stereo, files, a network
     shade: Callable[[Image, Mask], Depth] | None  # depth from the shading of an image inside a mask
     tools: Tools
+    hidden: Callable[[Image], Mask]  # where a frame shows nothing of the body: drawings, a border that moves
     filter_in_time: bool  # whether to filter depth over neighboring frames
     wanted: Callable[[Image], bool]  # whether an image (H, W, 3) belongs in the sequence
     sources: dict[str, str]  # where images, depth and masks come from
@@ -83,7 +84,10 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
     notes += depth_notes + mask_notes
     shade = None
     if relative:
-        images, usable = [f.rgb_u8 for f in samples], [geometry.inside & ~tools(f).mask for f in samples]
+        images, usable = (
+            [f.rgb_u8 for f in samples],
+            [geometry.inside & ~tools(f).mask & ~first_pass.hidden(f.rgb_u8) for f in samples],
+        )
         if measure is None:
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
         else:
@@ -96,7 +100,7 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
     wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
-    return FrameMethods(measure, shade, tools, kind == "sgbm", wanted, sources, relative, notes)
+    return FrameMethods(measure, shade, tools, first_pass.hidden, kind == "sgbm", wanted, sources, relative, notes)
 
 
 def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
@@ -334,7 +338,7 @@ def write_frames(
             depth = temporal_median([other.depth for other in window if other.depth is not None])
         found = methods.tools(frame)
         on_tools(frame.position, found)
-        tools = found.mask | ~geometry.inside
+        tools = found.mask | ~geometry.inside | methods.hidden(frame.rgb_u8)
         if methods.shade:
             depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:
@@ -349,7 +353,7 @@ def replace_by_carried(
     files: FrameFiles,
     segmenter: VideoSegmenter,
     inside: Mask,
-    shade: Callable[[Image, Mask], Depth] | None,
+    methods: FrameMethods,
     progress: Progress,
 ) -> list[str]:
     """Replace the masks of all written frames, their depth from shading, and the source of the masks in `files.meta`.
@@ -359,7 +363,7 @@ def replace_by_carried(
 
     Args:
         inside: (H, W) True inside the endoscope's image.
-        shade: depth from the shading of an image inside a mask; None if depth does not depend on masks.
+        methods: how depth follows from shading, if it depends on masks, and what frames hide.
     Returns:
         Notes for the user, one line each.
     """
@@ -376,10 +380,11 @@ def replace_by_carried(
             found_rows.append(asdict(FrameRow.of(i, found)))
         write_state(work, {"rows": found_rows})
     for i in range(files.count):
-        mask = store.mask(i) | ~inside
+        rgb_u8 = read_color(files.file("images", i))
+        mask = store.mask(i) | ~inside | methods.hidden(rgb_u8)
         write_mask(files.file("masks", i), mask, TOOL_VALUE)
-        if shade is not None:
-            depth = np.where(inside, shade(read_color(files.file("images", i)), ~mask), np.float32(0))
+        if methods.shade is not None:
+            depth = np.where(inside, methods.shade(rgb_u8, ~mask), np.float32(0))
             save_png(files.file("depth", i), files.depth_units(depth))
     rows = [FrameRow(**row) for row in read_state(work)["rows"]]
     write_rows(files.folder, rows)

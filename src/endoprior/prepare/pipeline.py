@@ -97,7 +97,7 @@ def prepare(
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
         carried_notes, moving = [], []
         if segmenter is not None:
-            carried_notes = replace_by_carried(files, segmenter, inside, methods.shade, progress)
+            carried_notes = replace_by_carried(files, segmenter, inside, methods, progress)
         if cfg.masks == "auto" or segmenter is not None:
             from .unmasked_motion import frames_with_unmasked_motion  # imports torch
 

@@ -26,7 +26,16 @@ from .source import ImageFolder, Source, open_source
 from .video import SourceFrame, Video
 
 KINDS: tuple[Layout, ...] = ("side-by-side", "top-bottom", "interlaced")  # how one frame can hold two images
-LOOK_ALIKE = 0.8  # correlation above which the halves of a frame are two views of the same scene
+LOOK_ALIKE, BY_CHANCE = 0.55, 0.15
+"""Correlation of the details of both halves of a frame above which they are two views of one scene, and by how much it
+exceeds that with one half upside down. Shading does not count: halves of a tube or of a round image are alike.
+"""
+HALF_SIZE, DETAIL_PX = (
+    (192, 128),
+    3.0,
+)  # (width, height) of compared halves, and the size of their details, px
+BLOCK, OFF_ROWS, OFF_COLUMNS = (28, 24), 5, 40  # (width, height) of a block, px, and how far away its match can lie
+LEAST_DETAIL = 1.0  # standard deviation of a block that shows something, levels
 GLIMPSES = 9  # number of images that tell the stereo layout
 CONTENT = 3.0  # least standard deviation, levels, of a frame that shows something, in each of its rows and columns
 EVEN = 0.25  # a time step that differs from the nominal one by more than this share is uneven
@@ -111,15 +120,34 @@ def _shows_something(frame: Image) -> bool:
 
 
 def _alike(frame: Image, layout: Layout) -> bool:
-    """Whether both halves show nearly the same image, up to a shift along x."""
+    """Whether both halves show nearly the same details, up to shifts along x."""
     gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
     if layout == "interlaced":
         rows = gray[: len(gray) // 2 * 2].astype(np.float32)
         # Rows of one camera are more similar to each other than to the rows of the other camera.
         own, other = np.abs(rows[2:] - rows[:-2]).mean(), np.abs(rows[1:] - rows[:-1]).mean()
         return bool(other > 1.2 * own)
-    first, second = (_small(half) for half in split_cameras(gray[..., None], layout) if half is not None)
-    return bool(cv2.matchTemplate(second, first[:, 16:-16], cv2.TM_CCOEFF_NORMED).max() > LOOK_ALIKE)
+    first, second = (_details(half) for half in split_cameras(gray[..., None], layout) if half is not None)
+    correlation, chance = _correlation(first, second), _correlation(first, second[::-1])
+    return correlation > LOOK_ALIKE and correlation - chance > BY_CHANCE
+
+
+def _correlation(first: NDArray, second: NDArray) -> float:
+    """Median over blocks of the first half of the correlation with the most similar place in the second; 0 for none."""
+    (width, height), found = BLOCK, list[float]()
+    for y in range(OFF_ROWS, HALF_SIZE[1] - height - OFF_ROWS + 1, height):
+        for x in range(OFF_COLUMNS, HALF_SIZE[0] - width - OFF_COLUMNS + 1, width):
+            block = first[y : y + height, x : x + width]
+            if block.std() > LEAST_DETAIL:
+                near = second[y - OFF_ROWS :, x - OFF_COLUMNS :][: height + 2 * OFF_ROWS, : width + 2 * OFF_COLUMNS]
+                found.append(float(cv2.matchTemplate(near, block, cv2.TM_CCOEFF_NORMED).max()))
+    return float(np.median(found)) if found else 0.0
+
+
+def _details(gray: NDArray) -> NDArray:
+    """A gray half of a frame at `HALF_SIZE` without its shading."""
+    half = cv2.resize(np.ascontiguousarray(gray), HALF_SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return half - cv2.GaussianBlur(half, (0, 0), DETAIL_PX)
 
 
 def _small(gray: NDArray) -> NDArray:
