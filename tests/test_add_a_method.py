@@ -124,6 +124,8 @@ def test_a_scene_whose_plugin_is_missing_names_what_to_install(tmp_path):
     said = str(caught.value)
     assert said.startswith(f"{tmp_path / 'scene.safetensors'}: method: expected one of ") and "got 'elsewhere'" in said
     assert said.count("Fix: ") == 1 and "Fix: Install the package with this plugin; " in said
+
+
 def test_the_worked_example_loads_and_its_score_is_that_of_means(tmp_path, tiny_sequence):
     with registered(tmp_path / "site"):
         spec = load_spec(BENCH)

@@ -10,7 +10,7 @@ from endoprior.prepare.calibration import Calibration, Intrinsics
 from endoprior.prepare.config import PrepareConfig, parse_rectangle
 from endoprior.prepare.frame_geometry import make_geometry
 from endoprior.prepare.frames import REACH, MeasuredFrame, with_neighbors
-from endoprior.prepare.video_clip import find_layout, split_cameras
+from endoprior.prepare.stereo_layout import find_layout, split_cameras
 from endoprior.prepare.work_folder import frames_done, work_folder
 
 
