@@ -19,7 +19,7 @@ from .. import render
 from ..core.config import Config
 from ..core.types import Camera, RenderedView, Splats
 from .method import Method, method_of
-from .playback import Background, faded, joined, rendered, rendered_many
+from .playback import Background, faded, joined, mixed, rendered, rendered_many
 
 if TYPE_CHECKING:
     from .single_scene import SingleScene
@@ -102,6 +102,10 @@ class RenderedScene(ABC):
         """`render` at several times, one camera each."""
         return [self.render(time, camera) for time, camera in zip(times, cameras, strict=True)]
 
+    def filmed(self, time: float, camera: Camera | None = None) -> RenderedView:
+        """`render` with the exposure and the smoke of that time, as a frame shows them."""
+        return self.render(time, camera)
+
     def camera_at(self, time: float) -> Camera:
         """Camera of the frame nearest in time."""
         return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
@@ -164,6 +168,17 @@ class Scene(RenderedScene):
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """See `RenderedScene.render`; where two windows show, the weighted mean of the pictures of both."""
         return rendered(self.parts_at(time), camera or self.camera_at(time), self.backend, self.background)
+
+    @torch.no_grad()
+    def filmed(self, time: float, camera: Camera | None = None) -> RenderedView:
+        """See `RenderedScene.filmed`."""
+        camera, parts = camera or self.camera_at(time), self.shown_at(time)
+        views = []
+        for part in parts:
+            scene = part.window.scene
+            view = rendered([(scene.at(part.time), 1.0)], camera, self.backend, self.background)
+            views.append((scene.shown(view, part.time), part.weight))
+        return mixed(views)
 
     @torch.no_grad()
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:

@@ -59,7 +59,8 @@ def load_scene(path: str | Path) -> RenderedScene:
 def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a scene's file of this description; `T` frames."""
     cfg = config_from(about["config"])
-    return method_of(cfg).schema(cfg) | CAMERAS
+    photometric = {"photometric": ArraySpec("float32", ("T", "I", "J", 2, 3))} if about.get("photometric") else {}
+    return method_of(cfg).schema(cfg) | CAMERAS | photometric
 
 
 def index_schema(_about: dict[str, Any]) -> dict[str, ArraySpec]:

@@ -46,6 +46,10 @@ class PhantomConfig:
     """Family of the two tools, by their color; `mixed`: one each of two families, printed and worn."""
     tissue: Tissue = "bowel"
     """Kind of tissue and view: its color, vessels and gloss; `warm` light; `smoke` that comes and goes; `blood`."""
+    smoke: float = 0.0
+    """Share of the light that the densest puff of smoke takes away within 80 mm, 0..0.95; `truth/` is free of it."""
+    gain: Literal["fixed", "auto"] = "fixed"
+    """`auto`: the exposure follows the mean brightness of the image, with a lag; `truth/tissue` keeps the first one."""
     camera: Literal["still", "inspect"] = "still"
     """`inspect`: the camera moves; every 300 frames or so it pans, turns, rolls, retreats, approaches and returns."""
     stereo: bool = False
@@ -91,12 +95,14 @@ class PhantomConfig:
             # The material reaches beyond the image by a share of its width: a narrow view has less of it.
             ("slide_mm", 0, min(12, 10.8 / self.focal_per_width) if self.focal_per_width > 0 else 12),
             ("smooth_share", 0, 0.9),
+            ("smoke", 0, 0.95),
             ("noise", 0, 20),
             ("depth_noise_px", 0, 2),
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
-        for name, known in (("instruments", get_args(Instruments)), ("tissue", get_args(Tissue))):
+        kinds = (("instruments", get_args(Instruments)), ("tissue", get_args(Tissue)), ("gain", ("fixed", "auto")))
+        for name, known in kinds:
             if getattr(self, name) not in known:
                 raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
         moves = self.camera == "inspect"
@@ -122,8 +128,8 @@ class PhantomConfig:
 
     @property
     def has_kinds(self) -> bool:
-        """Whether tools or tissue are others than the default; without, files are those of earlier versions."""
-        return self.instruments != "graspers" or self.tissue != "bowel"
+        """Whether tools, tissue or light are others than the default; without, files are those of earlier versions."""
+        return self.instruments != "graspers" or self.tissue != "bowel" or self.smoke > 0 or self.gain == "auto"
 
     @property
     def focal(self) -> float:

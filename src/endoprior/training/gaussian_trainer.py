@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -24,6 +24,7 @@ from ..model.gaussians import Gaussians, create_gaussians, motion_layout
 from ..model.hexplane import plane_shapes
 from ..model.method import method_of
 from ..model.motion import Field, Motion
+from ..model.photometric import of_all_frames
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
@@ -35,6 +36,7 @@ from .losses import StartTracks
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
+from .photometric import cleared_frames, photometric_grids
 from .step import TrainingStep
 from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
 
@@ -135,10 +137,18 @@ class GaussianTrainer(Trainer):
             background=torch.tensor(self.method.background, device=self.device),
         )
 
+    @cached_property
+    def grids(self) -> Tensor | None:
+        """(F, I, J, 2, 3) what lies between tissue and training frames, if anything: a function of the frames alone."""
+        found = photometric_grids(self.sequence.frames("train"), self.cfg.render.photometric)
+        return None if found is None else torch.from_numpy(found)
+
     def start(self) -> None:
         """See `Trainer.start`."""
-        cfg = self.cfg
-        first = self.method.first_gaussians(self.sequence.frames("train"), cfg)
+        cfg, frames = self.cfg, self.sequence.frames("train")
+        if self.grids is not None:
+            frames = cleared_frames(frames, self.grids.numpy())
+        first = self.method.first_gaussians(frames, cfg)
         cloud, motion, tracks = first.cloud, first.motion, None
         gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
         if motion is not None:
@@ -170,6 +180,7 @@ class GaussianTrainer(Trainer):
         rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
         optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
         stats = DensityStats.zeros(len(gaussians), self.device)
+        self.step_once.photometric = None if self.grids is None else self.grids.to(self.device)
         self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, shares)
 
     def schema(self) -> dict[str, ArraySpec]:
@@ -208,4 +219,5 @@ class GaussianTrainer(Trainer):
             lengths_are_relative=self.sequence.depth_is_relative,
             trained_from=trained[0] / num if holds else 0.0,
             trained_until=trained[-1] / num if holds else 1.0,
+            photometric=None if self.grids is None else of_all_frames(self.grids, trained, num),
         )
