@@ -200,6 +200,14 @@ class EvaluationContext:
         """All frames of the sequence as they are rendered, by index."""
         return RenderedFrames(self.reconstruction, self.sequence, self.split)
 
+    def tissue_color(self, index: int) -> NDArray[np.float32]:
+        """(H, W, 3) rendered color of a frame without smoke, rounded to 8 bits, in [0, 1]."""
+        scene = self.reconstruction.scene if isinstance(self.reconstruction, SceneFrames) else None
+        frame = self.sequence.frame(index)
+        if scene is None or scene.smoke_at(frame.time) is None:
+            return self.rendered[index].rgb
+        return to_uint8(scene.render(frame.time, frame.camera).color.cpu().numpy()) / np.float32(255)
+
     @property
     def rendered_scene(self) -> RenderedScene:
         """What renders the tissue from any camera; ScoreUnavailable where only rendered images are scored."""

@@ -1,15 +1,17 @@
-"""Photometric model: what lies between the tissue's color and a frame: exposure, and light that smoke scatters back.
+"""Photometric model: smoke between the tissue and the camera, apart from the tissue.
 
-Each frame has a coarse grid of coefficients. A pixel of tissue color c shows sqrt(G c^2 + V), with gain G and veil V
-interpolated bilinearly between the centers of the cells: the square is about the camera's gamma, so that light adds.
-The tissue itself is shown without it, at the exposure of clear frames.
+Each frame has a coarse grid of coefficients. A pixel of tissue color c shows sqrt(g c^2 + v): the gain g is the share
+of its light that comes through, the veil v the light that smoke scatters back. Both are interpolated bilinearly between
+the centers of cells, and the same for all channels: smoke is gray. Light adds in squares, about the camera's gamma.
 
-`T` frames, `I, J` rows and columns of the grid.
+`T` frames, `I, J` rows and columns of a grid.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,27 +21,18 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import interpolate
 
 from ..compute.fastmath import REORDERED
+from ..core.types import RenderedView
 
-Kind = Literal["none", "exposure", "smoke"]
-"""`exposure`: one gain for each channel of a frame; `smoke`: a grid of gains and veils, the same for all channels."""
-GRIDS: dict[str, tuple[int, int]] = {"exposure": (1, 1), "smoke": (18, 24)}
-"""Rows and columns of the grid."""
-LEAST, MOST = 0.02, 16.0
-"""Range of the gains, of squared color."""
-FLOOR = 1e-6  # of squared color: its root has a finite slope
-
-
-def neutral(num_frames: int, kind: str) -> Tensor:
-    """(T, I, J, 2, 3) coefficients that change nothing: gain 1, veil 0."""
-    grid = torch.zeros(num_frames, *GRIDS[kind], 2, 3)
-    grid[..., 0, :] = 1
-    return grid
+GRID = (18, 24)
+"""Rows and columns of the grids that training finds."""
+FLOOR = 1e-8  # added to squared color: the slope of its root is finite
 
 
 def filmed(color: Tensor, grid: Tensor) -> Tensor:
-    """(H, W, 3) what the camera shows of tissue of a color (H, W, 3), by the coefficients (I, J, 2, 3) of its frame.
+    """What a camera sees of tissue through smoke; differentiable in `color`.
 
-    Differentiable in `color`.
+    Args:
+        color: (H, W, 3) of the tissue. grid: (I, J, 2) gain and veil of the frame.
     """
     if color.device.type == "cpu" and color.dtype == torch.float32:
         return _Filmed.apply(color, grid)
@@ -48,68 +41,80 @@ def filmed(color: Tensor, grid: Tensor) -> Tensor:
 
 def filmed_torch(color: Tensor, grid: Tensor) -> Tensor:
     """See `filmed`."""
-    cells = grid.permute(2, 3, 0, 1).reshape(1, 6, *grid.shape[:2]).to(color)
-    gain, veil = interpolate(cells, color.shape[:2], mode="bilinear")[0].permute(1, 2, 0).split(3, -1)
-    return (gain * color.clamp(min=0) ** 2 + veil).clamp(min=FLOOR).sqrt()
+    cells = grid.permute(2, 0, 1)[None].to(color)
+    gain, veil = interpolate(cells, color.shape[:2], mode="bilinear")[0].unsqueeze(-1)
+    return (gain * color.clamp(min=0) ** 2 + veil + FLOOR).sqrt()
+
+
+def behind_smoke(view: RenderedView, grid: Tensor | None) -> RenderedView:
+    """A view of tissue as it looks through smoke of coefficients (I, J, 2); itself without any."""
+    return view if grid is None else replace(view, unclamped_color=filmed(view.unclamped_color, grid))
 
 
 class _Filmed(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, color: Tensor, grid: Tensor) -> Tensor:
+        color, grid = color.detach().contiguous(), grid.contiguous()
         shown, slope = torch.empty_like(color), torch.empty_like(color)
-        arrays = (t.detach().contiguous().numpy() for t in (color, grid))
-        _rows(*arrays, shown.numpy(), slope.numpy())
+        _rows(color.numpy(), grid.numpy(), shown.numpy(), slope.numpy())
         ctx.slope = slope
         return shown
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_shown: Tensor) -> tuple:
-        return v_shown * ctx.slope, None
+        return ctx.slope.mul_(v_shown), None
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
 def _rows(color, grid, shown, slope):
-    # One task per row; writes shown and slope = d shown / d color, (H, W, 3).
+    # One task per row y: writes shown[y] and slope[y] = d shown / d color. A row is one flat run of numbers, three per
+    # pixel: loops over it vectorize.
     height, width, _ = color.shape
     rows, columns = grid.shape[:2]
+    zero, floor = np.float32(0), np.float32(FLOOR)
+    colors, all_shown = color.reshape(height, 3 * width), shown.reshape(height, 3 * width)
+    slopes = slope.reshape(height, 3 * width)
+    left, right = np.empty(width, np.int64), np.empty(width, np.float32)
+    for x in range(width):
+        u = min(max((x + 0.5) * columns / width - 0.5, 0.0), columns - 1.0)
+        left[x], right[x] = min(int(u), columns - 2), u - min(int(u), columns - 2)
     for y in prange(height):
         v = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
         i = int(v)
-        below = np.float32(v - i)
-        line = grid[i] + below * (grid[min(i + 1, rows - 1)] - grid[i])
+        line = grid[i] + np.float32(v - i) * (grid[min(i + 1, rows - 1)] - grid[i])
+        both = np.empty((2, 3 * width), np.float32)
         for x in range(width):
-            u = min(max((x + 0.5) * columns / width - 0.5, 0.0), columns - 1.0)
-            j = int(u)
-            right, k = np.float32(u - j), min(j + 1, columns - 1)
-            for c in range(3):
-                gain = line[j, 0, c] + right * (line[k, 0, c] - line[j, 0, c])
-                veil = line[j, 1, c] + right * (line[k, 1, c] - line[j, 1, c])
-                value = max(color[y, x, c], np.float32(0))
-                square = gain * value * value + veil
-                root = np.sqrt(max(square, np.float32(FLOOR)))
-                shown[y, x, c] = root
-                slope[y, x, c] = gain * value / root if square > FLOOR else np.float32(0)
+            j = left[x]
+            for c in range(2):
+                value = line[j, c] + right[x] * (line[j + 1, c] - line[j, c])
+                both[c, 3 * x] = both[c, 3 * x + 1] = both[c, 3 * x + 2] = value
+        row, shown_row, slope_row, gain, veil = colors[y], all_shown[y], slopes[y], both[0], both[1]
+        for n in range(3 * width):
+            value = max(row[n], zero)
+            scaled = gain[n] * value
+            root = np.sqrt(scaled * value + veil[n] + floor)
+            shown_row[n] = root
+            slope_row[n] = scaled / root
 
 
-def between(grids: Tensor, frame: float) -> Tensor:
-    """(I, J, 2, 3) coefficients at a position between frames, of those of all frames (T, I, J, 2, 3)."""
-    position = min(max(frame, 0.0), len(grids) - 1.0)
+def between(grids: Tensor, position: float) -> Tensor:
+    """(I, J, 2) coefficients at a position between frames, interpolated in time from those of frames (T, I, J, 2)."""
+    position = min(max(position, 0.0), len(grids) - 1.0)
     first = int(position)
     return torch.lerp(grids[first], grids[min(first + 1, len(grids) - 1)], position - first)
 
 
-def of_all_frames(grids: Tensor, indices: tuple[int, ...] | list[int], num_frames: int) -> Tensor:
-    """(T, I, J, 2, 3): held-out frames get what lies between the training frames around them, interpolated in time.
+def of_all_frames(grids: Tensor, indices: Sequence[int], num_frames: int) -> Tensor:
+    """(T, I, J, 2) of all frames from those of the training frames `indices`, (F, I, J, 2).
 
-    Args:
-        grids: (F, I, J, 2, 3) of the training frames `indices`, in order.
+    Held-out frames get what lies between their neighbors: nothing is fitted to them.
     """
     positions = np.interp(np.arange(num_frames), indices, np.arange(len(indices)))
     return torch.stack([between(grids, float(position)) for position in positions])
 
 
-def possible(grids: Tensor) -> bool:
-    """Whether stored coefficients can have been trained: gains in range, veils that take no light away."""
-    gain, veil = grids.unbind(3)
-    return bool((gain > 0).all() and (gain < 1e4).all() and (veil >= 0).all() and (veil < 1e4).all())
+def is_possible(grids: Tensor) -> bool:
+    """Whether stored coefficients can be those of a training."""
+    gain, veil = grids.unbind(-1)
+    return bool((gain > 0).all() and (gain < 1e3).all() and (veil >= 0).all() and (veil < 1e3).all())

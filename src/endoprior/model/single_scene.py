@@ -13,12 +13,12 @@ from torch import Tensor
 
 from .. import render
 from ..core.config import Config
-from ..core.types import Camera, RenderedView, Splats
+from ..core.types import Camera, Splats
 from ..system.arrays_file import part, save_arrays
 from .gaussians import Gaussians
 from .motion import Field, Motion, Offsets
 from .ops import ops_for
-from .photometric import between, filmed, possible
+from .photometric import is_possible
 from .scene import Scene, Window
 from .scene_facts import MOST_GAUSSIANS, SceneFacts, camera_arrays, demand, scene_facts
 
@@ -46,8 +46,8 @@ class SingleScene(Scene):
     trained_until: float = 1.0
     """... and after this one too: a temporal basis that nothing holds leads anywhere."""
     rendered_by: render.Backend | None = None
-    photometric: Tensor | None = None
-    """(T, I, J, 2, 3) what lies between tissue and each frame (`photometric.filmed`); None: nothing."""
+    smoke: Tensor | None = None
+    """(T, I, J, 2) gain and veil of each frame: see `photometric`; None: no smoke."""
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -67,13 +67,6 @@ class SingleScene(Scene):
     def parts_at(self, time: float) -> list[tuple[Splats, float]]:
         """See `Scene.parts_at`."""
         return [(self.at(time), 1.0)]
-
-    def shown(self, view: RenderedView, time: float) -> RenderedView:
-        """What the camera shows at `time` in [0, 1] of the tissue that a `view` shows: exposed, and behind smoke."""
-        if self.photometric is None:
-            return view
-        grid = between(self.photometric, time * len(self.photometric))
-        return replace(view, unclamped_color=filmed(view.unclamped_color, grid))
 
     def offsets(self, gaussians: Gaussians, time: float) -> Offsets:
         """Deformation of some Gaussians of the scene at `time` in [0, 1]."""
@@ -135,7 +128,7 @@ class SingleScene(Scene):
             ("gaussians", num <= MOST_GAUSSIANS, f"at most {MOST_GAUSSIANS:,} Gaussians"),
             ("gaussians.quats", not num or bool((quats.abs().amax(1) >= 1e-12).all()), "no quaternion of length 0"),
             ("num_valid", bool((arrays["num_valid"] >= 0).all()), "counts"),
-            ("photometric", "photometric" not in arrays or possible(arrays["photometric"]), "gains and veils"),
+            ("smoke", "smoke" not in arrays or is_possible(arrays["smoke"]), "gains and veils"),
         )
         return SingleScene(
             Gaussians(part(arrays, "gaussians.")),
@@ -148,7 +141,7 @@ class SingleScene(Scene):
             facts.lengths_are_relative,
             facts.trained_from,
             facts.trained_until,
-            photometric=arrays.get("photometric"),
+            smoke=arrays.get("smoke"),
         )
 
     def save(self, path: Path) -> None:
@@ -161,6 +154,6 @@ class SingleScene(Scene):
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         about: dict[str, Any] = {"trained_from": self.trained_from, "trained_until": self.trained_until}
-        if self.photometric is not None:
-            arrays["photometric"], about["photometric"] = self.photometric, True
+        if self.smoke is not None:
+            arrays["smoke"], about["smoke"] = self.smoke, True
         save_arrays(path, arrays, scene_facts(self) | about, FORMAT)

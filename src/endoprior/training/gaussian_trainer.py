@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
@@ -36,7 +37,7 @@ from .losses import StartTracks
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
-from .photometric import cleared_frames, photometric_grids
+from .photometric import ClearedFrames, smoke_of
 from .step import TrainingStep
 from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
 
@@ -138,16 +139,25 @@ class GaussianTrainer(Trainer):
         )
 
     @cached_property
-    def grids(self) -> Tensor | None:
-        """(F, I, J, 2, 3) what lies between tissue and training frames, if anything: a function of the frames alone."""
-        found = photometric_grids(self.sequence.frames("train"), self.cfg.render.photometric)
-        return None if found is None else torch.from_numpy(found)
+    def smoke(self) -> NDArray[np.float32] | None:
+        """(F, I, J, 2) of the training frames: see `photometric`; a function of these frames alone."""
+        return smoke_of(self.sequence.frames("train"), self.cfg.render.photometric)
+
+    def notes(self) -> list[str]:
+        """See `Trainer.notes`."""
+        if self.smoke is None:
+            return []
+        share = (self.smoke[..., 1].max((1, 2)) > 0).mean()
+        return [
+            f"smoke in {share:.0%} of the training frames; it is modeled apart from the tissue "
+            "(--render.photometric none takes it for tissue)"
+        ]
 
     def start(self) -> None:
         """See `Trainer.start`."""
         cfg, frames = self.cfg, self.sequence.frames("train")
-        if self.grids is not None:
-            frames = cleared_frames(frames, self.grids.numpy())
+        if self.smoke is not None:
+            frames = ClearedFrames(frames, self.smoke)
         first = self.method.first_gaussians(frames, cfg)
         cloud, motion, tracks = first.cloud, first.motion, None
         gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
@@ -180,7 +190,7 @@ class GaussianTrainer(Trainer):
         rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
         optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
         stats = DensityStats.zeros(len(gaussians), self.device)
-        self.step_once.photometric = None if self.grids is None else self.grids.to(self.device)
+        self.step_once.smoke = None if self.smoke is None else torch.from_numpy(self.smoke).to(self.device)
         self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, shares)
 
     def schema(self) -> dict[str, ArraySpec]:
@@ -219,5 +229,5 @@ class GaussianTrainer(Trainer):
             lengths_are_relative=self.sequence.depth_is_relative,
             trained_from=trained[0] / num if holds else 0.0,
             trained_until=trained[-1] / num if holds else 1.0,
-            photometric=None if self.grids is None else of_all_frames(self.grids, trained, num),
+            smoke=None if self.smoke is None else of_all_frames(torch.from_numpy(self.smoke), trained, num),
         )

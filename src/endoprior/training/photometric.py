@@ -1,10 +1,10 @@
-"""Finds what lies between tissue and frames before the training: exposure, smoke, or nothing worth a model.
+"""Finds smoke in the training frames, before the training: whether there is any, and the coefficients of each frame.
 
-Frame by frame, from the clearest one to both ends, coefficients are solved for: the least-squares fit of the frame's
-squared colors by those of the tissue as the frames before show it, cell by cell. They are functions of the training
-frames alone and stay fixed while training: fitted along with the tissue, they would end where it started, in haze.
+From the clearest frame on to both ends, the squared colors of each frame are fitted by those of the tissue as the
+frames before show it, cell by cell, by least squares (see `model.photometric`). The result is a function of the
+training frames alone, and stays fixed while training: fitted along with the tissue, smoke stays in it (docs/log.md).
 
-`F` training frames, `h, w` size of the resized image, `I, J` rows and columns of the grid.
+`F` training frames, `h, w` size of the resized frames, `I, J` rows and columns of the grid.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Frame
-from ..model.photometric import GRIDS, LEAST, MOST, Kind, neutral
+from ..model.photometric import GRID
 
-WORK_SIZE = (192, 144)  # width and height at which frames are compared, px: 8 x 8 for each cell of the finest grid
+CELL_PX = 8  # side of a cell of the resized frames
 SQUARE = 0.05  # usual square of a color
 HELD_GAIN, HELD_VEIL = 0.1 * SQUARE, 1.0 * SQUARE
-"""How strongly coefficients are held to those of the frame before, or of a wider neighborhood, as shares of a cell's
-pixels."""
+"""How strongly coefficients are held to those of the frame before, and then of a wider neighborhood, as shares of the
+pixels of a cell."""
 COARSE, FINE = 3.0, 0.7  # standard deviation of the neighborhood in which a coefficient is fitted, cells
+LEAST_GAIN, MOST_GAIN = 0.02, 16.0
 FOLLOW = 0.15  # share by which a frame changes the running mean of the tissue
 BRIGHT = 0.95  # color from which a pixel does not count: the sensor is saturated
 CLEAR = 0.01  # mean veil up to which a frame counts as clear, about: the gains of clear frames average to 1
-WINDOW, DARK = 17, 0.01  # side of a neighborhood whose contrast is measured, px; light below which contrast is noise
+WINDOW_PX, DARK = 17, 0.01  # neighborhood whose contrast is measured; light below which contrast is noise
 HAZY_GRAY, HAZY_LOSS = 0.06, 0.45
 """Rise of gray, and loss of contrast, from the clearest frame on, which together only smoke explains."""
 
@@ -42,45 +43,48 @@ class Small(NamedTuple):
 
 
 def resized(frame: Frame) -> Small:
-    """A frame at `WORK_SIZE`."""
-    color = cv2.resize(frame.rgb_u8, WORK_SIZE, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-    share = cv2.resize(frame.tissue_mask.astype(np.float32), WORK_SIZE, interpolation=cv2.INTER_AREA)
-    return Small(color**2, ((share > 0.99) & (color.max(-1) < BRIGHT)).astype(np.float32))
+    """A frame with `CELL_PX` for each cell."""
+    size = GRID[1] * CELL_PX, GRID[0] * CELL_PX
+    color = cv2.resize(frame.rgb_u8, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(255)
+    share = cv2.resize(frame.tissue_mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return Small(np.asarray(color**2, np.float32), ((share > 0.99) & (color.max(-1) < BRIGHT)).astype(np.float32))
 
 
 @dataclass(frozen=True)
 class Looks:
-    """How frames look that smoke may veil, (F,) each, smoothed over time."""
+    """What smoke changes in the looks of frames, (F,) each, smoothed over time."""
 
     gray: NDArray[np.float64]
     """Smallest over largest channel of the tissue, 0 to 1: smoke adds about the same light to all channels."""
     contrast: NDArray[np.float64]
-    """Standard deviation over mean of the light in a neighborhood: smoke takes light away, and adds the same to all."""
+    """Standard deviation over mean of the light around a pixel: smoke takes light away, and adds the same to all."""
 
     @property
     def clearest(self) -> int:
-        """The frame with most contrast."""
+        """The frame of most contrast."""
         return int(self.contrast.argmax())
 
     @property
     def haze(self) -> NDArray[np.float64]:
-        """(F,) 0 for a frame like the clearest one; from 1 on, both the rise of gray and the loss of contrast mean smoke."""
+        """(F,) 0 in frames like the clearest one; from 1 on, only smoke explains both what rises and what is lost."""
         first = self.clearest
         rise, loss = self.gray - self.gray[first], 1 - self.contrast / max(self.contrast[first], 1e-6)
         return np.maximum(np.minimum(rise / HAZY_GRAY, loss / HAZY_LOSS), 0)
 
 
 def looks_of(frames: Sequence[Small]) -> Looks:
-    """What tells smoke."""
+    """Measure frames, in the order of time."""
     gray, contrast = [], []
     for square, weight in frames:
-        total = max(float(weight.sum()), 1e-6)
         light = square.mean(-1)
-        share, mean, second = (cv2.blur(values, (WINDOW, WINDOW)) for values in (weight, weight * light, weight * light**2))
+        share, mean, second = (
+            cv2.blur(values, (WINDOW_PX, WINDOW_PX)) for values in (weight, weight * light, weight * light**2)
+        )
         mean, second = mean / (share + 1e-6), second / (share + 1e-6)
         ratio = np.sqrt(np.maximum(second - mean**2, 0)) / (mean + DARK)
-        contrast.append(float((weight * ratio).sum()) / total)
-        gray.append(np.sqrt((square.min(-1) * weight).sum() / max((square.max(-1) * weight).sum(), 1e-6)))
+        contrast.append(float((weight * ratio).sum() / max(weight.sum(), 1e-6)))
+        lowest, highest = (float((values * weight).sum()) for values in (square.min(-1), square.max(-1)))
+        gray.append(np.sqrt(lowest / max(highest, 1e-6)))
     return Looks(_smoothed(gray), _smoothed(contrast))
 
 
@@ -89,118 +93,93 @@ def _smoothed(values: Sequence[float]) -> NDArray[np.float64]:
     return (padded[:-2] + padded[1:-1] + padded[2:]) / 3
 
 
-def needed(looks: Looks) -> Kind:
-    """The photometric model that frames need."""
-    return "smoke" if looks.haze.max() >= 1 else "none"
+def smoke_needed(looks: Looks) -> bool:
+    """Whether frames show so much smoke at times that it needs a model."""
+    return bool(looks.haze.max() >= 1)
 
 
-def photometric_grids(frames: Sequence[Frame], wanted: str) -> NDArray[np.float32] | None:
-    """(F, I, J, 2, 3) coefficients of training frames; None where nothing lies between them and the tissue.
+def smoke_of(frames: Sequence[Frame], wanted: str) -> NDArray[np.float32] | None:
+    """(F, I, J, 2) gain and veil of training frames; None without smoke.
 
     Args:
-        wanted: a kind, or `auto` for the one that the frames need.
+        wanted: `smoke`, `none`, or `auto` to decide by the frames.
     """
     if wanted == "none":
         return None
     small = [resized(frame) for frame in frames]
-    kind = wanted
-    if wanted == "auto":
-        kind = needed(looks_of(small))
-    return None if kind == "none" else fitted_grids(small, kind)
+    looks = looks_of(small)
+    return fitted_grids(small, looks) if wanted == "smoke" or smoke_needed(looks) else None
 
 
-def fitted_grids(frames: Sequence[Small], kind: str) -> NDArray[np.float32]:
-    """(F, I, J, 2, 3) coefficients of frames, in the order of time.
+def fitted_grids(frames: Sequence[Small], looks: Looks) -> NDArray[np.float32]:
+    """(F, I, J, 2) gain and veil of frames, in the order of time.
 
-    Each frame is compared with a running mean of those before it, freed of what lies before the tissue. Between two
-    frames tissue and camera move little, at this resolution.
+    Each frame is compared with a running mean of those before it, freed of smoke. Between two frames tissue and camera
+    move little, at this resolution.
     """
-    looks, grids = looks_of(frames), neutral(len(frames), kind).numpy()
-    first = looks.clearest
+    neutral, first = np.zeros((*GRID, 2), np.float32), looks.clearest
+    neutral[..., 0] = 1
+    grids = np.stack([neutral] * len(frames))
     for order in (range(first + 1, len(frames)), range(first - 1, -1, -1)):
-        tissue, known, held = frames[first].square.copy(), frames[first].weight.copy(), grids[first]
+        tissue, known, held = frames[first].square.copy(), frames[first].weight.copy(), neutral
         for k in order:
             target, weight = frames[k]
-            held = grids[k] = fitted(tissue, target, weight * known, held, kind)
-            gain, veil = spread(held, weight.shape)
-            clear = np.maximum(target - veil, 0) / gain
-            share = weight * np.where(known > 0, FOLLOW * np.minimum(gain.mean(-1), 1), 1)
-            tissue += share[..., None] * (clear - tissue)
+            held = grids[k] = fitted(tissue, target, weight * known, held)
+            gain, veil = of_pixels(held, weight.shape)
+            share = weight * np.where(known > 0, FOLLOW * np.minimum(gain, 1), 1)
+            tissue += share[..., None] * (np.maximum(target - veil[..., None], 0) / gain[..., None] - tissue)
             known = np.maximum(known, weight)
-    normalize(grids)
-    if kind == "smoke":  # frames that look like the clearest one have none
-        smoky = np.minimum(looks.haze, 1)[:, None, None, None, None].astype(np.float32)
-        grids = smoky * grids + (1 - smoky) * neutral(len(frames), kind).numpy()
-    return grids
+    clear = np.exp(-grids[..., 1].mean((1, 2)) / CLEAR)
+    grids[..., 0] /= np.exp(clear @ np.log(grids[..., 0]).mean((1, 2)) / clear.sum())
+    smoky = np.minimum(looks.haze, 1).astype(np.float32)[:, None, None, None]
+    return np.asarray(
+        smoky * grids + (1 - smoky) * neutral, np.float32
+    )  # frames that look like the clearest one have none
 
 
-def fitted(tissue: NDArray, target: NDArray, weight: NDArray, held: NDArray, kind: str) -> NDArray[np.float32]:
-    """(I, J, 2, 3) coefficients with which `tissue` becomes `target`, both (h, w, 3) squared colors.
+def fitted(tissue: NDArray, target: NDArray, weight: NDArray, held: NDArray) -> NDArray[np.float32]:
+    """(I, J, 2) gain and veil with which `tissue` becomes `target`, both (h, w, 3) squared colors.
 
     Args:
-        weight: (h, w) of the pixels. held: (I, J, 2, 3) coefficients that those of cells with few pixels tend to.
+        weight: (h, w) of the pixels. held: (I, J, 2) coefficients of the frame before.
     """
-    rows, columns = held.shape[:2]
-    products = np.stack([np.ones_like(tissue), tissue, target, tissue**2, tissue * target], -1)
-    products *= weight[..., None, None]  # (h, w, 3, 5)
-    h, w = weight.shape
-    sums = products.reshape(rows, h // rows, columns, w // columns, 3, 5).mean((1, 3))
-    if kind == "exposure":
-        *_, tt, tf = np.moveaxis(sums, -1, 0)
-        gain = (tf + HELD_GAIN * SQUARE * held[:, :, 0]) / (tt + HELD_GAIN * SQUARE)
-        return np.stack([np.clip(gain, LEAST, MOST), np.zeros_like(gain)], 2).astype(np.float32)
-    for width in COARSE, FINE:  # cells that show little tissue get what lies before the tissue around them
-        held = _gray_fit(cv2.GaussianBlur(sums.mean(2), (0, 0), width), held)
-    return held
+    products = np.stack([np.ones_like(tissue), tissue, target, tissue**2, tissue * target], -1).mean(2)
+    products *= weight[..., None]  # (h, w, 5)
+    sums = products.reshape(GRID[0], CELL_PX, GRID[1], CELL_PX, 5).mean((1, 3))
+    found = held
+    for width in COARSE, FINE:  # cells that show little tissue get the smoke around them
+        one, t, f, tt, tf = np.moveaxis(cv2.GaussianBlur(sums, (0, 0), width), -1, 0)
+        a, b, c = tt + HELD_GAIN, t, one + HELD_VEIL
+        p, q = tf + HELD_GAIN * found[..., 0], f + HELD_VEIL * found[..., 1]
+        determinant = np.maximum(a * c - b * b, 1e-12)
+        gain, veil = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+        gain = np.where(veil < 0, p / a, gain)  # smoke adds light
+        found = np.stack([np.clip(gain, LEAST_GAIN, MOST_GAIN), np.maximum(veil, 0)], -1)
+    return np.asarray(found, np.float32)
 
 
-def _gray_fit(sums: NDArray, held: NDArray) -> NDArray[np.float32]:
-    """`fitted` of smoke: channels share their coefficients. Args: sums: (I, J, 5) means of 1, t, f, t^2 and t f."""
-    one, t, f, tt, tf = np.moveaxis(sums, -1, 0)
-    a, b, c = tt + HELD_GAIN, t, one + HELD_VEIL
-    p, q = tf + HELD_GAIN * held[:, :, 0, 0], f + HELD_VEIL * held[:, :, 1, 0]
-    determinant = np.maximum(a * c - b * b, 1e-12)
-    gain, veil = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-    gain = np.where(veil < 0, p / a, gain)  # no veil takes light away
-    gain, veil = np.clip(gain, LEAST, MOST), np.maximum(veil, 0)
-    return np.repeat(np.stack([gain, veil], 2)[..., None], 3, -1).astype(np.float32)
-
-
-def normalize(grids: NDArray[np.float32]) -> None:
-    """Scale gains (F, I, J, 2, 3) in place, so that those of clear frames have the geometric mean 1 in each channel."""
-    clear = np.exp(-grids[:, :, :, 1].mean((1, 2, 3)) / CLEAR)
-    logs = np.log(grids[:, :, :, 0]).mean((1, 2))  # (F, 3)
-    grids[:, :, :, 0] /= np.exp((clear @ logs) / clear.sum())
-
-
-def spread(grid: NDArray, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
-    """Gain and veil of every pixel, (h, w, 3) each, of coefficients (I, J, 2, 3); `shape` is (h, w)."""
-    size = shape[1], shape[0]
-    gain, veil = (cv2.resize(grid[:, :, k], size, interpolation=cv2.INTER_LINEAR) for k in (0, 1))
-    return gain.reshape(*shape, 3), veil.reshape(*shape, 3)
+def of_pixels(grid: NDArray, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
+    """Gain and veil of every pixel, `shape` (h, w) each, of coefficients (I, J, 2)."""
+    gain, veil = (cv2.resize(grid[..., k], shape[::-1], interpolation=cv2.INTER_LINEAR) for k in (0, 1))
+    return gain, veil
 
 
 def cleared(frame: Frame, grid: NDArray) -> Frame:
-    """The frame without what its coefficients (I, J, 2, 3) say lies before the tissue."""
-    gain, veil = spread(grid, frame.tissue_mask.shape)
-    color = np.sqrt(np.maximum(frame.rgb**2 - veil, 0) / gain)
+    """The frame without the smoke that its coefficients (I, J, 2) say: where Gaussians start."""
+    gain, veil = of_pixels(grid, frame.tissue_mask.shape)
+    color = np.sqrt(np.maximum(frame.rgb**2 - veil[..., None], 0) / gain[..., None])
     return replace(frame, rgb_u8=(np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8))
 
 
-def cleared_frames(frames: Sequence[Frame], grids: NDArray) -> Sequence[Frame]:
-    """`cleared` of training frames (F), each when it is used."""
-    return _Cleared(frames, grids)
-
-
 @dataclass(frozen=True)
-class _Cleared(Sequence[Frame]):
+class ClearedFrames(Sequence[Frame]):
+    """Training frames (F) as `cleared` makes them, each when it is used."""
+
     frames: Sequence[Frame]
-    grids: NDArray
+    grids: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, position):  # pyright: ignore[reportIncompatibleMethodOverride]
-        if isinstance(position, slice):
-            return _Cleared(self.frames[position], self.grids[position])
+    def __getitem__(self, position: int) -> Frame:  # pyright: ignore[reportIncompatibleMethodOverride]
         return cleared(self.frames[position], self.grids[position])

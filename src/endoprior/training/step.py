@@ -84,7 +84,7 @@ class TrainingStep:
     check: DivergenceCheck
     doubt: MaskDoubt | None  # takes missed tools out of the frames; None trusts the masks
     background: Tensor  # (3,) color behind everything
-    photometric: Tensor | None = None  # (F, I, J, 2, 3) what lies between tissue and frames; None: nothing
+    smoke: Tensor | None = None  # (F, I, J, 2) of each training frame: see `model.photometric`; None: no smoke
 
     @cached_property
     def context(self) -> Any:
@@ -169,8 +169,8 @@ class TrainingStep:
         )
         out = render(splats)
         out.means2d.retain_grad()  # density control grows where this gradient is large
-        if self.photometric is not None:
-            out = replace(out, color=filmed(out.color, self.photometric[position]))
+        if self.smoke is not None:
+            out = replace(out, color=filmed(out.color, self.smoke[position]))
         compared, left_out = frame, None
         if self.doubt and fine and not is_right and self._knows_tissue(state):
             compared = self.doubt.counted(frame, out.color)
