@@ -45,7 +45,7 @@ class Render(Command):
     highlights: bool = True
     """`--no-highlights` shows the tissue below them, as other frames show it. Default: RUN/renders/no_highlights."""
     smoke: bool = True
-    """`--no-smoke` shows the tissue without the smoke that training found. Default: RUN/renders/no_smoke."""
+    """`--no-smoke` leaves out the smoke that training found. Default: RUN/renders/no_smoke."""
     data: Path | None = None
     """Sequence folder with the input frames. Default: the one the run was trained on."""
     device: Wanted = "auto"

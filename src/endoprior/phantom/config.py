@@ -47,9 +47,9 @@ class PhantomConfig:
     tissue: Tissue = "bowel"
     """Kind of tissue and view: its color, vessels and gloss; `warm` light; `smoke` that comes and goes; `blood`."""
     smoke: float = 0.0
-    """Share of the light that the densest puff of smoke takes away within 80 mm, 0..0.95; `truth/` is free of it."""
+    """Light that smoke takes, 0..0.95. The share that is lost in the densest puff within 80 mm; `truth/` shows none."""
     gain: Literal["fixed", "auto"] = "fixed"
-    """`auto`: the exposure follows the mean brightness of the image, with a lag; `truth/tissue` keeps the first one."""
+    """`auto`: exposure follows brightness with a lag; truth/tissue keeps the first one."""
     camera: Literal["still", "inspect"] = "still"
     """`inspect`: the camera moves; every 300 frames or so it pans, turns, rolls, retreats, approaches and returns."""
     stereo: bool = False
