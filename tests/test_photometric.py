@@ -16,8 +16,11 @@ from endoprior import evaluate, load_scene, load_sequence, train
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.model.photometric import GRID, between, filmed, filmed_torch, of_all_frames
+from endoprior.model.windowed_scene import Span, WindowedScene
 from endoprior.runs.train import start_run
 from endoprior.training.photometric import fitted_grids, looks_of, of_pixels, resized, smoke_needed, smoke_of
+from endoprior.view.viewable import ViewSettings
+from endoprior.view.viewable_scene import ViewableScene
 
 SMOKE, LIGHT = 0.65, 0.3  # share of the light that the densest smoke takes, and squared color of smoke
 
@@ -211,3 +214,29 @@ def test_smoke_that_no_training_finds_is_rejected(run, tmp_path):
     file.write(tmp_path / "scene.safetensors")
     with pytest.raises(InputError, match="smoke"):
         load_scene(tmp_path / "scene.safetensors")
+
+
+def test_the_viewer_shows_tissue_and_smoke_when_asked(run):
+    scene = load_scene(run)
+    viewable, camera = ViewableScene(scene, "run"), scene.cameras[9]
+    assert viewable.has_smoke
+    pictures = [viewable.picture(ViewSettings(frame=9, smoke=smoke), camera) for smoke in (False, True)]
+    for picture, view in zip(pictures, (scene.render(9 / 17), scene.filmed(9 / 17)), strict=True):
+        assert np.abs(picture / 255 - view.color.numpy()).max() < 0.003
+    aside = ViewSettings(frame=9, smoke=True, endoscope=False)
+    assert np.array_equal(viewable.picture(aside, camera), pictures[0])  # smoke is known in the endoscope's view only
+
+
+def test_windows_fade_their_smoke_and_one_without_takes_the_other(run):
+    scene = load_scene(run)
+    twin = replace(scene, smoke=scene.smoke * 2)
+    parts = [scene, twin]
+    spans = tuple(Span(start, start + 17, len(scene)) for start in (0, 7))
+    windows = WindowedScene(scene.config, scene.cameras + scene.cameras[:7], 25.0, spans, parts.__getitem__)
+    first, second = windows.shown_at(12 / 24)
+    want = first.weight * between(scene.smoke, 12) + second.weight * between(twin.smoke, 5)
+    torch.testing.assert_close(windows.smoke_at(12 / 24), want)
+    parts[1] = replace(scene, smoke=None)
+    alone = WindowedScene(scene.config, scene.cameras + scene.cameras[:7], 25.0, spans, parts.__getitem__)
+    torch.testing.assert_close(alone.smoke_at(12 / 24), between(scene.smoke, 12))
+    assert alone.smoke_at(20 / 24) is None
