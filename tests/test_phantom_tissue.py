@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 import pytest
 
-from endoprior.phantom import PhantomConfig
+from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.camera import STILL, Eye
 from endoprior.phantom.config import Tissue
 from endoprior.phantom.raster import FAR
 from endoprior.phantom.scene import Moment, build_scene
-from endoprior.phantom.sensor import develop, exposure_gain, vignette
+from endoprior.phantom.sensor import develop, exposure_gain, metered, next_gain, vignette
 from endoprior.phantom.smoke import Smoke
 from endoprior.phantom.surface import build_anatomy, organs_at
 from endoprior.phantom.texture import LOOKS, bled
@@ -160,3 +161,36 @@ def test_a_liver_is_liver_everywhere(scenes):
     assert (organs_at(anatomy, a, b).owner >= 0).mean() > 0.5
     hue = {kind: scenes[kind].texture[..., 1] / scenes[kind].texture[..., 0] for kind in ("bowel", "liver")}
     assert hue["liver"].std() < 0.02 < 0.05 < hue["bowel"].std()
+
+
+# --- smoke and gain beside the kind of tissue ------------------------------------------------------------------------
+
+
+def test_smoke_option_veils_images_and_leaves_the_truth_clear():
+    plain, smoky = (build_scene(replace(SMALL, smoke=share)) for share in (0.0, 0.66))
+    before, after = (render_view(scene, Moment.of(scene, 0.45), STILL) for scene in (plain, smoky))
+    assert np.array_equal(before.tissue, after.tissue)
+    assert np.abs(before.image - after.image).mean() > 0.05
+    kind = build_scene(replace(SMALL, tissue="smoke"))
+    assert np.array_equal(render_view(kind, Moment.of(kind, 0.45), STILL).image, after.image)
+
+
+def test_automatic_gain_follows_brightness_with_a_lag():
+    gains = [1.0]
+    for measured in [0.2] * 3 + [0.4] * 40:
+        gains.append(next_gain(gains[-1], measured, 0.2))
+    assert gains[3] == 1 and 0.5 < gains[5] < 0.9 and gains[-1] == pytest.approx(0.5, rel=1e-3)
+    image = np.zeros((9, 9, 3), np.float32)
+    image[4, 4] = 1
+    corner = np.roll(image, 4, (0, 1))
+    assert metered(image) > 10 * metered(corner)
+
+
+def test_the_folder_has_the_true_gains(tmp_path):
+    write_phantom(tmp_path / "auto", replace(SMALL, frames=6, gain="auto", smoke=0.5, side_views=False))
+    write_phantom(tmp_path / "plain", replace(SMALL, frames=6, side_views=False))
+    described = json.loads((tmp_path / "auto/truth/scene.json").read_text())
+    assert len(described["gain"]) == len(described["smoke"]) == 6 and described["gain"][0] == 1 != described["gain"][-1]
+    for index in range(6):
+        one, other = ((tmp_path / name / f"truth/tissue/{index:06d}.png").read_bytes() for name in ("auto", "plain"))
+        assert one == other

@@ -44,6 +44,8 @@ class Render(Command):
     """JSON list of {"time", "world_to_camera"} to render instead of a split; it has times and cameras of its own."""
     highlights: bool = True
     """`--no-highlights` shows the tissue below them, as other frames show it. Default: RUN/renders/no_highlights."""
+    smoke: bool = True
+    """`--no-smoke` leaves out the smoke that training found. Default: RUN/renders/no_smoke."""
     data: Path | None = None
     """Sequence folder with the input frames. Default: the one the run was trained on."""
     device: Wanted = "auto"
@@ -104,7 +106,7 @@ class Render(Command):
         images = out / {"color": "rgb"}.get(self.layer, self.layer)
         with removed_on_failure(self.out or out):
             if self.layer == "color":
-                write_views(scene, views, out, video, frames)
+                write_views(scene, views, out, video, frames, smoke=self.smoke)
             elif self.layer == "texture":
                 write_texture_film(with_gaussians(scene, self.run), views, images, video, frames)
             else:
@@ -115,11 +117,12 @@ class Render(Command):
         say(f"{len(views)} frames: {out if self.layer == 'color' else images}\nvideo: {video}")
 
     def _places(self, run: Path) -> tuple[Path, Path]:
-        """The folder for images and the file of the video; what is there with highlights is kept."""
+        """The folder for images and the file of the video; what is there with highlights and smoke is kept."""
         out = self.out or run / "renders"
         video = (self.out or run) / ("video.mp4" if self.layer == "color" else f"{self.layer}.mp4")
         if not self.out and out.is_symlink():  # in an untrusted run the link could point anywhere
             raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
-        if self.highlights or self.out:
+        left_out = [f"no_{name}" for name in ("highlights", "smoke") if not getattr(self, name)]
+        if not left_out or self.out:
             return out, video
-        return out / "no_highlights", video.with_stem(f"{video.stem}_no_highlights")
+        return out / "_".join(left_out), video.with_stem("_".join([video.stem, *left_out]))

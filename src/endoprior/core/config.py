@@ -92,6 +92,8 @@ class RenderConfig:
     """Let the gradient of rendered depth reach the composited z; EndoGaussian's rasterizer drops it."""
     color_slopes: bool = True
     """The color of a Gaussian changes linearly along its first two axes: finer texture with as many Gaussians."""
+    photometric: Literal["auto", "none", "smoke"] = "auto"
+    """What lies between tissue and camera: `smoke`, a veil of each frame; `auto`: one if training frames show smoke."""
 
 
 @dataclass(frozen=True)

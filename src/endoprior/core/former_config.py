@@ -151,6 +151,15 @@ def _former_values(new: Values) -> dict[str, Any]:
     }
 
 
+def _completed(stored: dict[str, Any]) -> dict[str, Any]:
+    """A stored config with the fields that it had no choice of: what was trained before there was one."""
+    if _is_literal(stored):
+        stored = {"data.reliability": "ignored"} | stored
+    if "render.depth_grad_to_means" in stored:  # a whole group, as runs store it
+        stored = {"render.photometric": "none"} | stored
+    return stored
+
+
 def current_form(values: dict[str, Any], fields: Collection[str], own: bool) -> dict[str, Any]:
     """The nested values of a stored config as this version names them; one line on stderr says what is ignored.
 
@@ -162,13 +171,11 @@ def current_form(values: dict[str, Any], fields: Collection[str], own: bool) -> 
     """
     if any("." in str(name) for name in values):
         return values  # is rejected
-    stored = dict(_flat(values))
+    stored = _completed(dict(_flat(values)))
     gone = [name for name in GONE if name not in fields and any(f"{n}.".startswith(f"{name}.") for n in stored)]
     stored = {n: value for n, value in stored.items() if not f"{n}.".startswith(tuple(f"{name}." for name in gone))}
     known = _former_values({})
     old = {name: value for name, value in stored.items() if name in known}
-    if "data.reliability" not in stored and _is_literal(stored):
-        stored["data.reliability"] = "ignored"
     if not (gone or old):
         return _nested(stored)
     new = {name: value for name, value in stored.items() if name not in known} | _moved(stored)

@@ -61,7 +61,7 @@ class SceneFrames:
     def render(self, index: int) -> Rendering:
         """See `Reconstruction.render`."""
         frame = self.sequence.frame(index)
-        out = self.scene.render(frame.time, frame.camera)
+        out = self.scene.filmed(frame.time, frame.camera)
         return out.color.cpu().numpy(), out.depth.cpu().numpy()
 
 
@@ -204,6 +204,15 @@ class EvaluationContext:
     def rendered(self) -> RenderedFrames:
         """All frames of the sequence as they are rendered, by index."""
         return RenderedFrames(self.reconstruction, self.sequence, self.split)
+
+    def tissue_color(self, index: int) -> NDArray[np.float32]:
+        """(H, W, 3) rendered color of a frame without smoke, rounded to 8 bits, in [0, 1]."""
+        scene = self.reconstruction.scene if isinstance(self.reconstruction, SceneFrames) else None
+        frame = self.sequence.frame(index)
+        if scene is None or scene.smoke_at(frame.time) is None:
+            return self.rendered[index].rgb
+        rgb_u8 = to_uint8(scene.render(frame.time, frame.camera).color.cpu().numpy())
+        return np.asarray(rgb_u8 / np.float32(255), np.float32)
 
     @property
     def rendered_scene(self) -> RenderedScene:

@@ -60,6 +60,8 @@ def evaluate(
         frames, reading = SceneFrames(scene, sequence), reading or scene.config.data
         fps = f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
         rendering = {"backend": scene.backend, "fps": f"{fps}{LONGEST_SECONDS:g} s; {name_of(scene.device)}"}
+        if any(scene.smoke_at(i / len(sequence)) is not None for i in sequence.indices(split)):
+            rendering["smoke"] = "images as filmed: held-out frames through smoke interpolated between training frames"
     else:
         frames = scene
     reading = reading or DataConfig()

@@ -54,7 +54,7 @@ def paper() -> Config:
             motion="rest",
         ),
         deformation=replace(base.deformation, kind="hexplane", max_scale_change=0.0),
-        render=replace(base.render, depth_grad_to_means=False, color_slopes=False),
+        render=replace(base.render, depth_grad_to_means=False, color_slopes=False, photometric="none"),
         loss=replace(
             base.loss,
             depth_weight=1.0,

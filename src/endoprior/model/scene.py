@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from .. import render
 from ..core.config import Config
 from ..core.types import Camera, RenderedView, Splats
 from .method import Method, method_of
+from .photometric import behind_smoke, between
 from .playback import Background, faded, joined, rendered, rendered_many
 
 if TYPE_CHECKING:
@@ -102,6 +104,14 @@ class RenderedScene(ABC):
         """`render` at several times, one camera each."""
         return [self.render(time, camera) for time, camera in zip(times, cameras, strict=True)]
 
+    def smoke_at(self, _time: float) -> Tensor | None:
+        """(I, J, 2) gain and veil of the smoke that the endoscope sees at a time: see `photometric`; None: none."""
+        return None
+
+    def filmed(self, time: float, camera: Camera | None = None) -> RenderedView:
+        """`render` with the smoke of that time, as frames show it."""
+        return behind_smoke(self.render(time, camera), self.smoke_at(time))
+
     def camera_at(self, time: float) -> Camera:
         """Camera of the frame nearest in time."""
         return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
@@ -164,6 +174,15 @@ class Scene(RenderedScene):
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """See `RenderedScene.render`; where two windows show, the weighted mean of the pictures of both."""
         return rendered(self.parts_at(time), camera or self.camera_at(time), self.backend, self.background)
+
+    def smoke_at(self, time: float) -> Tensor | None:
+        """See `RenderedScene.smoke_at`."""
+        found = [(part.window.scene.smoke, part) for part in self.shown_at(time)]
+        grids = [(between(smoke, part.time * len(smoke)), part.weight) for smoke, part in found if smoke is not None]
+        if not grids:
+            return None
+        weights = torch.tensor([weight for _, weight in grids])  # a window without smoke was not asked
+        return torch.einsum("k,kijc->ijc", weights / weights.sum(), torch.stack([grid for grid, _ in grids]).cpu())
 
     @torch.no_grad()
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:

@@ -19,6 +19,7 @@ from ..core.types import Camera
 from ..system.arrays_file import ArraySpec, load_arrays, rejecting
 from . import windowed_scene
 from .method import config_from, method_of
+from .photometric import GRID
 from .scene import RenderedScene
 from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SceneFacts, camera_arrays, demand
 from .single_scene import FORMAT, SingleScene
@@ -59,7 +60,8 @@ def load_scene(path: str | Path) -> RenderedScene:
 def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a scene's file of this description; `T` frames."""
     cfg = config_from(about["config"])
-    return method_of(cfg).schema(cfg) | CAMERAS
+    smoke = {"smoke": ArraySpec("float32", ("T", *GRID, 2))} if about.get("smoke") else {}
+    return method_of(cfg).schema(cfg) | CAMERAS | smoke
 
 
 def index_schema(_about: dict[str, Any]) -> dict[str, ArraySpec]:

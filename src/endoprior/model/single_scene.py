@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from ..system.arrays_file import part, save_arrays
 from .gaussians import Gaussians
 from .motion import Field, Motion, Offsets
 from .ops import ops_for
+from .photometric import is_possible
 from .scene import Scene, Window
 from .scene_facts import MOST_GAUSSIANS, SceneFacts, camera_arrays, demand, scene_facts
 
@@ -44,6 +46,8 @@ class SingleScene(Scene):
     trained_until: float = 1.0
     """... and after this one too: a temporal basis that nothing holds leads anywhere."""
     rendered_by: render.Backend | None = None
+    smoke: Tensor | None = None
+    """(T, I, J, 2) gain and veil of each frame: see `photometric`; None: no smoke."""
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -124,6 +128,7 @@ class SingleScene(Scene):
             ("gaussians", num <= MOST_GAUSSIANS, f"at most {MOST_GAUSSIANS:,} Gaussians"),
             ("gaussians.quats", not num or bool((quats.abs().amax(1) >= 1e-12).all()), "no quaternion of length 0"),
             ("num_valid", bool((arrays["num_valid"] >= 0).all()), "counts"),
+            ("smoke", "smoke" not in arrays or is_possible(arrays["smoke"]), "gains and veils"),
         )
         return SingleScene(
             Gaussians(part(arrays, "gaussians.")),
@@ -136,6 +141,7 @@ class SingleScene(Scene):
             facts.lengths_are_relative,
             facts.trained_from,
             facts.trained_until,
+            smoke=arrays.get("smoke"),
         )
 
     def save(self, path: Path) -> None:
@@ -147,5 +153,7 @@ class SingleScene(Scene):
         arrays |= camera_arrays(self.cameras)
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
-        about = {"trained_from": self.trained_from, "trained_until": self.trained_until}
+        about: dict[str, Any] = {"trained_from": self.trained_from, "trained_until": self.trained_until}
+        if self.smoke is not None:
+            arrays["smoke"], about["smoke"] = self.smoke, True
         save_arrays(path, arrays, scene_facts(self) | about, FORMAT)

@@ -18,6 +18,7 @@ WIDEST_MOVING = 0.75
 Instruments = Literal[
     "graspers", "gray_blue", "black", "white_plastic", "steel", "gold", "green", "blue", "mixed"
 ]  # fmt: skip
+Gain = Literal["fixed", "auto"]
 Tissue = Literal["bowel", "pale", "fat", "purple", "liver", "warm", "smoke", "blood"]
 Border = Literal["none", "octagon", "oval", "rounded"]
 
@@ -47,6 +48,10 @@ class PhantomConfig:
     """Family of the two tools, by their color; `mixed`: one each of two families, printed and worn."""
     tissue: Tissue = "bowel"
     """Kind of tissue and view: its color, vessels and gloss; `warm` light; `smoke` that comes and goes; `blood`."""
+    smoke: float = 0.0
+    """Light that smoke takes, 0..0.95. The share that is lost in the densest puff within 80 mm; `truth/` shows none."""
+    gain: Gain = "fixed"
+    """`auto`: exposure follows brightness with a lag; truth/tissue keeps the first one."""
     camera: Literal["still", "inspect"] = "still"
     """`inspect`: the camera moves; every 300 frames or so it pans, turns, rolls, retreats, approaches and returns."""
     border: Border = "none"
@@ -96,12 +101,13 @@ class PhantomConfig:
             # The material reaches beyond the image by a share of its width: a narrow view has less of it.
             ("slide_mm", 0, min(12, 10.8 / self.focal_per_width) if self.focal_per_width > 0 else 12),
             ("smooth_share", 0, 0.9),
+            ("smoke", 0, 0.95),
             ("noise", 0, 20),
             ("depth_noise_px", 0, 2),
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
-        choices = {"instruments": Instruments, "tissue": Tissue, "border": Border}
+        choices = {"instruments": Instruments, "tissue": Tissue, "border": Border, "gain": Gain}
         for name, known in ((name, get_args(kinds)) for name, kinds in choices.items()):
             if getattr(self, name) not in known:
                 raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
@@ -128,8 +134,8 @@ class PhantomConfig:
 
     @property
     def has_kinds(self) -> bool:
-        """Whether tools or tissue are others than the default; without, files are those of earlier versions."""
-        return self.instruments != "graspers" or self.tissue != "bowel"
+        """Whether tools, tissue or light are others than the default; without, files are those of earlier versions."""
+        return self.instruments != "graspers" or self.tissue != "bowel" or self.smoke > 0 or self.gain == "auto"
 
     @property
     def focal(self) -> float:

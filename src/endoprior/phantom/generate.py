@@ -14,7 +14,7 @@ from ..data.writer import FrameFiles, SequenceMeta, new_sequence
 from .camera import STILL, Eye
 from .config import PhantomConfig
 from .scene import Moment, Scene, build_scene
-from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
+from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth, vignette
 from .surround import border, overlay, surrounded
 from .texture import smooth_patches
 from .views import pixel_hits, render_view, shown_elsewhere, side_eyes, side_view, visible_points
@@ -59,7 +59,9 @@ def _regions(scene: Scene, tracked: NDArray[np.int64]) -> NDArray[np.str_]:
     return names[tracked[:, 0], tracked[:, 1]]
 
 
-def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], None] | None = None) -> None:
+def write_phantom(
+    out: Path, cfg: PhantomConfig, progress: Callable[[int, int], None] = lambda _done, _total: None
+) -> None:
     """Write a synthetic sequence folder with ground truth to `out`.
 
     Beside the sequence (images, masks, depth, poses, `sequence.json`) it writes
@@ -73,8 +75,9 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
       0 where the endoscope does not see the tissue; `truth/side/world_to_camera.json` has their poses (4, 4);
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
-    - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, and the density of smoke
-      in each frame, 0..1; `truth/tissue` shows the smoke too, the side cameras do not;
+    - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, the density of smoke in
+      each frame, 0..1, and its exposure relative to the first one. `truth/tissue` has the exposure of the first frame
+      and shows the smoke of `cfg.tissue`, not that of `cfg.smoke`; the side cameras see none;
     - with `cfg.border` `truth/border.npy`, (H, W) bool, True outside; with `cfg.overlay` `truth/overlay/*.npy`, True
       on the drawing;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
@@ -93,15 +96,17 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             writer.write_array("truth/border.npy", outside)
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
-        points, visible, gain, sides = [], [], 0.0, {}
+        points, visible, gains, sides, gain, first_gain, wanted = [], [], [], {}, 0.0, 0.0, 0.0
         ever_seen, behind_tools = np.zeros(scene.a.shape, bool), {}
         for index in range(cfg.frames):
             now = Moment.of(scene, index / (cfg.frames - 1))
             view = render_view(scene, now, STILL)
             z = pixel_hits(now.vertices, cfg)[..., 2]
             if index == 0:
-                gain = exposure_gain(view.tissue) * scene.look.exposure
+                first_gain = gain = exposure_gain(view.tissue) * scene.look.exposure
+                wanted = gain * metered(view.image)
                 sides = side_eyes(float(np.median(z))) if cfg.side_views else {}
+            gains.append(gain / first_gain)
             rng = np.random.default_rng([cfg.seed, 6, index])
             image = expose(develop(view.image, gain, lens), cfg.noise, rng)
             mask = cv2.dilate((view.tool_share > 0).astype(np.uint8), rim) > 0
@@ -112,24 +117,22 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
                 other = render_view(scene, now, Eye.moved(cfg.baseline_mm))
                 right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
                 right = surrounded(right, outside, drawn)
-            writer.write_image("truth/tissue", np.round(develop(view.tissue, gain, lens)).astype(np.uint8))
+            writer.write_image("truth/tissue", np.round(develop(view.tissue, first_gain, lens)).astype(np.uint8))
             writer.write_array(f"truth/depth/{index:06d}.npy", z)
             seen = visible_points(now.vertices, z, mask, cfg)
             points.append(now.vertices[tracked[:, 0], tracked[:, 1]])
             visible.append(seen[tracked[:, 0], tracked[:, 1]])
             if is_test_frame(index):
                 behind_tools[index] = np.packbits(mask)
-                for name, eye in sides.items():
-                    picture, depth = side_view(scene, now, eye, z, mask, gain)
-                    writer.write_image(f"truth/side/{name}", picture)
-                    writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
+                _write_sides(writer, sides, index, (scene, now, z, mask, first_gain))
             else:
                 ever_seen |= seen
             depth = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
             depth[outside] = 0
             writer.add(surrounded(image, outside, drawn), mask | outside | drawn, depth, right)
-            if progress is not None:
-                progress(index + 1, cfg.frames)
+            if cfg.gain == "auto":
+                gain = next_gain(gain, metered(view.image), wanted)
+            progress(index + 1, cfg.frames)
         for index, packed in behind_tools.items():  # what is seen later is known only now
             hits = pixel_hits(scene.seen_vertices(index / (cfg.frames - 1)), cfg)
             tool = np.unpackbits(packed, count=hits[..., 0].size).reshape(hits.shape[:2]) > 0
@@ -137,10 +140,24 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         regions = {"region": _regions(scene, tracked)} if cfg.has_regions else {}
         tracks = {"points": np.stack(points).astype(np.float32), "visible": np.stack(visible)}
         writer.write_arrays("truth/tracks.npz", **tracks, **regions)
-        _write_descriptions(writer, scene, sides)
+        _write_descriptions(writer, scene, sides, gains)
 
 
-def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye]) -> None:
+def _write_sides(
+    writer: FrameFiles,
+    sides: dict[str, Eye],
+    index: int,
+    seen: tuple[Scene, Moment, NDArray, NDArray, float],
+) -> None:
+    """What the side cameras see of a frame, as `side_view` takes it: picture and depth."""
+    scene, now, front_z, tool, gain = seen
+    for name, eye in sides.items():
+        picture, depth = side_view(scene, now, eye, front_z, tool, gain)
+        writer.write_image(f"truth/side/{name}", picture)
+        writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
+
+
+def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye], gains: list[float]) -> None:
     """Poses of the cameras, the calibration of the pair, and kinds of tools and tissue, where they are not obvious."""
     cfg = scene.cfg
     if scene.path.excursions:
@@ -170,6 +187,8 @@ def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye])
         described: dict[str, object] = {"instruments": cfg.instruments, "tools": tools, "tissue": cfg.tissue}
         if scene.smoke is not None:
             described["smoke"] = [round(scene.smoke.density(k / (cfg.frames - 1)), 4) for k in range(cfg.frames)]
+        if cfg.gain == "auto":
+            described["gain"] = [round(gain, 5) for gain in gains]
         writer.write_json("truth/scene.json", described)
 
 

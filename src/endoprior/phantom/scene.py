@@ -97,7 +97,8 @@ def build_scene(cfg: PhantomConfig) -> Scene:
         lowered = [replace(p, height=float(height.flat[k])) for p, k in zip(motion.pulls, nearest, strict=True)]
         motion = replace(motion, pulls=tuple(lowered))
     tools = instruments_of(cfg.instruments, cfg.seed)
-    smoke = Smoke.of(cfg, look.smoke) if look.smoke > 0 else None
+    strongest = cfg.smoke or look.smoke
+    smoke = Smoke.of(cfg, strongest) if strongest > 0 else None
     return Scene(cfg, plane, motion, a, b, height, texture, path, look, tools, smoke)
 
 

@@ -13,10 +13,27 @@ _KNEE = 0.55
 _TARGET_MEDIAN = 0.15
 """Exposed radiance of the middle of the first frame; about 0.42 of full scale after the tone curve."""
 
+_LAG_FRAMES = 4
+"""Frames in which automatic gain makes up for two thirds of a change of brightness, about."""
+_METER_SHARE = 0.35
+"""Standard deviation of the weight with which it measures, as a share of half the width and height."""
+
 
 def exposure_gain(radiance: NDArray[np.float32]) -> float:
     """The gain that maps the median of a tool-free image (H, W, 3) to the target; constant over the sequence."""
     return _TARGET_MEDIAN / max(float(np.median(radiance @ np.array([0.30, 0.59, 0.11], np.float32))), 1e-6)
+
+
+def metered(radiance: NDArray[np.float32]) -> float:
+    """Mean radiance of an image (H, W, 3) as automatic gain measures it: the middle counts most."""
+    y, x = (np.linspace(-1, 1, size)[:, None] for size in radiance.shape[:2])
+    weight = np.exp(-(y**2 + x.T**2) / (2 * _METER_SHARE**2))
+    return float((radiance.mean(-1) * weight).sum() / weight.sum())
+
+
+def next_gain(gain: float, measured: float, wanted: float) -> float:
+    """The gain of the next frame: on its way to the one that exposes the radiance `measured` now as `wanted`."""
+    return gain * (wanted / max(gain * measured, 1e-6)) ** (1 / _LAG_FRAMES)
 
 
 def vignette(width: int, height: int) -> NDArray[np.float32]:

@@ -35,7 +35,7 @@ class RenderedView:
 
     tissue: NDArray
     image: NDArray
-    """(H, W, 3) linear radiance without and with tools."""
+    """(H, W, 3) linear radiance without and with tools, and smoke of `cfg.smoke`."""
     tool_share: NDArray
     """(H, W) share of each pixel that is covered by a tool, 0..1."""
     tool_depth: NDArray
@@ -55,7 +55,8 @@ def render_view(scene: Scene, now: Moment, eye: Eye) -> RenderedView:
     image = np.where(is_tool[..., None], color, tissue) * light
     tissue = tissue * light
     if scene.smoke is not None:
-        tissue = scene.smoke.veiled(tissue, z, now.phase, eye, focal, center)
+        if not scene.cfg.smoke:  # smoke as a kind of tissue belongs to the truth
+            tissue = scene.smoke.veiled(tissue, z, now.phase, eye, focal, center)
         image = scene.smoke.veiled(image, np.minimum(z, depth), now.phase, eye, focal, center)
     nearest = np.minimum.reduce([depth[i::n, j::n] for i in range(n) for j in range(n)])
     share = _pooled(is_tool.astype(np.float32), scene.cfg)

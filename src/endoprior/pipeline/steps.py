@@ -168,7 +168,7 @@ def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for k, frame in enumerate(frames):
-            view = scene.render(frame.time, frame.camera)
+            view = scene.filmed(frame.time, frame.camera)
             depth = view.depth.cpu().numpy()
             name = "EndoPrior-GS" + (" (frame not used)" if frame.index in left_out else "")
             shown = {

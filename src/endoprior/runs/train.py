@@ -166,6 +166,8 @@ class TrainingRun:
         for warning in sequence.validate():
             say(f"note: {warning}")
         self.trainer = method_of(cfg).trainer(sequence, cfg)
+        for note in self.trainer.notes():
+            say(f"note: {note}")
 
     @freed_memory_kept()
     def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> RenderedScene:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
@@ -24,6 +25,7 @@ from ..model.gaussians import Gaussians, create_gaussians, motion_layout
 from ..model.hexplane import plane_shapes
 from ..model.method import method_of
 from ..model.motion import Field, Motion
+from ..model.photometric import of_all_frames
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
@@ -35,6 +37,7 @@ from .losses import StartTracks
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
+from .photometric import ClearedFrames, smoke_of
 from .step import TrainingStep
 from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
 
@@ -135,10 +138,27 @@ class GaussianTrainer(Trainer):
             background=torch.tensor(self.method.background, device=self.device),
         )
 
+    @cached_property
+    def smoke(self) -> NDArray[np.float32] | None:
+        """(F, I, J, 2) of the training frames: see `photometric`; a function of these frames alone."""
+        return smoke_of(self.sequence.frames("train"), self.cfg.render.photometric)
+
+    def notes(self) -> list[str]:
+        """See `Trainer.notes`."""
+        if self.smoke is None:
+            return []
+        share = (self.smoke[..., 1].max((1, 2)) > 0).mean()
+        return [
+            f"smoke in {share:.0%} of the training frames; it is modeled apart from the tissue "
+            "(--render.photometric none takes it for tissue)"
+        ]
+
     def start(self) -> None:
         """See `Trainer.start`."""
-        cfg = self.cfg
-        first = self.method.first_gaussians(self.sequence.frames("train"), cfg)
+        cfg, frames = self.cfg, self.sequence.frames("train")
+        if self.smoke is not None:
+            frames = ClearedFrames(frames, self.smoke)
+        first = self.method.first_gaussians(frames, cfg)
         cloud, motion, tracks = first.cloud, first.motion, None
         gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
         if motion is not None:
@@ -170,6 +190,7 @@ class GaussianTrainer(Trainer):
         rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
         optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
         stats = DensityStats.zeros(len(gaussians), self.device)
+        self.step_once.smoke = None if self.smoke is None else torch.from_numpy(self.smoke).to(self.device)
         self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, shares)
 
     def schema(self) -> dict[str, ArraySpec]:
@@ -208,4 +229,5 @@ class GaussianTrainer(Trainer):
             lengths_are_relative=self.sequence.depth_is_relative,
             trained_from=trained[0] / num if holds else 0.0,
             trained_until=trained[-1] / num if holds else 1.0,
+            smoke=None if self.smoke is None else of_all_frames(torch.from_numpy(self.smoke), trained, num),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +19,7 @@ from ..core.types import Camera, RenderOutput, Splats
 from ..model.gaussians import Gaussians
 from ..model.hexplane_field import HexPlaneField
 from ..model.motion import Field, Motion, Offsets
+from ..model.photometric import filmed
 from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
@@ -83,6 +84,7 @@ class TrainingStep:
     check: DivergenceCheck
     doubt: MaskDoubt | None  # takes missed tools out of the frames; None trusts the masks
     background: Tensor  # (3,) color behind everything
+    smoke: Tensor | None = None  # (F, I, J, 2) of each training frame: see `model.photometric`; None: no smoke
 
     @cached_property
     def context(self) -> Any:
@@ -167,6 +169,8 @@ class TrainingStep:
         )
         out = render(splats)
         out.means2d.retain_grad()  # density control grows where this gradient is large
+        if self.smoke is not None:
+            out = replace(out, color=filmed(out.color, self.smoke[position]))
         compared, left_out = frame, None
         if self.doubt and fine and not is_right and self._knows_tissue(state):
             compared = self.doubt.counted(frame, out.color)

@@ -109,6 +109,10 @@ class Trainer(ABC):
             Diverged: as `step`.
         """
 
+    def notes(self) -> list[str]:
+        """Lines for the user, before the training, about what the frames ask for."""
+        return []
+
     @property
     def finished(self) -> bool:
         """Whether all iterations are done."""

@@ -68,6 +68,7 @@ class Panel:
             hint = "Displacement and stretch are measured since this frame."
             self.since = gui.add_slider("Since frame", 0, max(total - 1, 1), 1, 0, visible=trained, hint=hint)
             self.tool = gui.add_checkbox("Tool overlay", False, visible=viewable.has_tool)
+            self.smoke = gui.add_checkbox("Smoke", False, visible=viewable.has_smoke)
             self.tracks = gui.add_checkbox("Material tracks", False)
             self.clip_end = float(np.ceil(CLIP_MARGIN * viewable.span[1])) or 1.0
             step, unit = 10.0 ** np.floor(np.log10(self.clip_end / 100)), length_unit(viewable.relative)
@@ -146,6 +147,7 @@ class Panel:
             in_browser=self.rendered_by.value == BROWSER,
             points=self.rendered_as.value == POINTS,
             tool=self.tool.value,
+            smoke=self.smoke.value,
             correcting=self.correct.value,
             since=min(int(self.since.value), self._total - 1),
             tracks=self.tracks.value,

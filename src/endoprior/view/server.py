@@ -185,7 +185,7 @@ class Viewer:
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
         on_change(self.read_panel, controls.layer, controls.camera, controls.riding, controls.rendered_by)
-        on_change(self.read_panel, controls.rendered_as, controls.tool, controls.tracks, controls.clip)
+        on_change(self.read_panel, controls.rendered_as, controls.tool, controls.smoke, controls.tracks, controls.clip)
         on_change(self.read_panel, controls.correct, controls.since)
         on_change(self._restart_clock, controls.speed)
         on_change(self.read_clicking, controls.measure, controls.follow, controls.quantity)

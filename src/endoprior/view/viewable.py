@@ -41,6 +41,8 @@ class ViewSettings:
     """Small opaque dots in place of splats."""
     tool: bool = False
     """Show the tool of the input frame on top, with an outline."""
+    smoke: bool = False
+    """Show the smoke that the endoscope saw, in its view; False: the tissue alone."""
     correcting: bool = False
     """Show the tool mask in color, to correct it; only with the endoscope camera of a sequence."""
     near: float = 0.0

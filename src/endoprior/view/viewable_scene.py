@@ -19,6 +19,7 @@ from ..model.carry import CarriedPoints, carry, centers_then
 from ..model.colors import FEW_ITERATIONS, one_color
 from ..model.gaussians import SH_C0, with_colors
 from ..model.measures import SurfaceMotion, distance
+from ..model.photometric import behind_smoke
 from ..model.playback import Playback
 from ..model.scene import Scene
 from ..model.surface import Support, Surface, project_visible, shown_pixels
@@ -63,6 +64,7 @@ class ViewableScene:
         self.cameras, self.frames_per_second = scene.cameras, scene.frames_per_second
         self.relative = scene.lengths_are_relative
         self.has_tool, self.mask_edits = sequence is not None, None
+        self.has_smoke = any(window.scene.smoke is not None for window in scene.windows)
         self._playback, self._rasterize = Playback(scene), render.load(scene.backend)
         self._measured = lru_cache(MAX_MEASURED)(self._measure)
         self._value_span = lru_cache(MAX_MEASURED)(self._span_of)
@@ -85,7 +87,8 @@ class ViewableScene:
         if kind == "frame":
             picture = original
         elif kind == "difference":
-            difference = cv2.absdiff(self._rendered("color", settings, camera), original).mean(-1) / 255
+            shown = self._rendered("color", replace(settings, smoke=True), camera)
+            difference = cv2.absdiff(shown, original).mean(-1) / 255
             picture = colorize(difference, 0, LARGEST_DIFFERENCE)
         else:
             picture = self._rendered(kind, settings, camera)
@@ -103,6 +106,9 @@ class ViewableScene:
         if kind in VALUE_LAYERS:  # black where little is known: no surface, or nothing known of it
             value, known, _ = np.moveaxis(color, -1, 0)
             return colorize(value / np.maximum(known, 1e-6), 0, 1, known > SOLID_ALPHA)
+        if settings.smoke and settings.endoscope:
+            view = behind_smoke(out.view, self.scene.smoke_at(settings.frame / len(self.cameras)))
+            color = view.color.cpu().numpy()
         return to_u8(color)
 
     def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:

@@ -27,7 +27,7 @@ class ViewableSequence:
     """Frames of a sequence folder; its methods are those of `ViewableScene`."""
 
     layers: tuple[Layer, ...] = ("frame", "depth", "prior")
-    has_tool = True
+    has_tool, has_smoke = True, False
 
     def __init__(self, sequence: FrameSequence) -> None:
         self.sequence, self.title = sequence, str(sequence.path)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Frame
+from ..model.photometric import behind_smoke
 from ..model.scene import RenderedScene
 from ..system.atomic import whole_file
 from .camera_paths import View
@@ -20,13 +21,20 @@ AT_A_TIME = 8
 
 
 def write_views(
-    scene: RenderedScene, views: list[View], out: Path, video: Path, frames: Sequence[Frame] | None = None
+    scene: RenderedScene,
+    views: list[View],
+    out: Path,
+    video: Path,
+    frames: Sequence[Frame] | None = None,
+    *,
+    smoke: bool = True,
 ) -> None:
     """Write each view to `out/rgb/*.png`, `out/depth/*.npy` (mm, float32) and `out/side_by_side/*.png`, and a video.
 
     Args:
         frames: the input frames, one per view; without them the side-by-side shows color and depth only.
         video: path of the mp4 of the side-by-side images.
+        smoke: show the smoke of each time, where the scene has any.
     """
     span, at_a_time = depth_span(scene), 1 if scene.device.type == "cpu" else AT_A_TIME
 
@@ -34,6 +42,7 @@ def write_views(
         for start in range(0, len(views), at_a_time):
             times, cameras = zip(*views[start : start + at_a_time], strict=True)
             for k, rendered in enumerate(scene.render_many(list(times), list(cameras)), start):
+                rendered = behind_smoke(rendered, scene.smoke_at(views[k][0])) if smoke else rendered
                 color, depth = to_u8(rendered.color.cpu().numpy()), rendered.depth.cpu().numpy()
                 write_png(out / "rgb" / f"{file_stem(k, frames)}.png", color)
                 with whole_file(out / "depth" / f"{file_stem(k, frames)}.npy") as temporary:
