@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache
@@ -55,34 +55,38 @@ class Batch(Command):
 
     def execute(self) -> int:
         """Do every job of the list and write the table; 1 if one failed."""
-        from ..pipeline import SUMMARY, TABLE, run_here, run_on, write_summary
-        from ..runs import kernel_cache
-        from ..runs.folder import LOCK
-        from ..system.file_lock import locked
-        from ..system.ray_cluster import connected
+        return do_all(entries_of(self.list, self.out, cache(say)), self.out, str(self.list), self.ray)
 
-        entries = entries_of(self.list, self.out, cache(say))
-        require_writable_folder("OUT", self.out)
-        waiting = [entry for entry in entries if not entry.is_done]
-        say(f"{self.list}: {len(entries)} jobs, {len(entries) - len(waiting)} done before")
-        for entry in waiting:
-            kernel_cache.fill(entry.job.cfg, say)
-        outcomes = []
-        with connected(self.ray, say) if self.ray and waiting else nullcontext() as cluster:
-            self.out.mkdir(parents=True, exist_ok=True)
-            with locked(self.out, self.out / LOCK):
-                try:
-                    for outcome in run_on(cluster, entries, say) if cluster else run_here(entries, _shown):
-                        _tell(outcome)
-                        outcomes.append(outcome)
-                except KeyboardInterrupt:
-                    say("Stopped. To resume, run the same command again.")
-                    raise
-                outcomes.sort(key=lambda outcome: entries.index(outcome.entry))
-                lines = write_summary(outcomes, self.out)
-        for line in ("", *lines, f"\nThis table: {self.out / SUMMARY}; all scores: {self.out / TABLE}"):
-            say(line)
-        return 1 if any(outcome.failure for outcome in outcomes) else 0
+
+def do_all(entries: Sequence[Entry], out: Path, title: str, ray: str | None = None) -> int:
+    """Do jobs one after the other, or on a Ray cluster, and write their table into `out`; 1 if one failed."""
+    from ..pipeline import SUMMARY, TABLE, run_here, run_on, write_summary
+    from ..runs import kernel_cache
+    from ..runs.folder import LOCK
+    from ..system.file_lock import locked
+    from ..system.ray_cluster import connected
+
+    require_writable_folder("OUT", out)
+    waiting = [entry for entry in entries if not entry.is_done]
+    say(f"{title}: {len(entries)} jobs, {len(entries) - len(waiting)} done before")
+    for entry in waiting:
+        kernel_cache.fill(entry.job.cfg, say)
+    outcomes = []
+    with connected(ray, say) if ray and waiting else nullcontext() as cluster:
+        out.mkdir(parents=True, exist_ok=True)
+        with locked(out, out / LOCK):
+            try:
+                for outcome in run_on(cluster, entries, say) if cluster else run_here(entries, _shown):
+                    _tell(outcome)
+                    outcomes.append(outcome)
+            except KeyboardInterrupt:
+                say("Stopped. To resume, run the same command again.")
+                raise
+            outcomes.sort(key=lambda outcome: entries.index(outcome.entry))
+            lines = write_summary(outcomes, out)
+    for line in ("", *lines, f"\nThis table: {out / SUMMARY}; all scores: {out / TABLE}"):
+        say(line)
+    return 1 if any(outcome.failure for outcome in outcomes) else 0
 
 
 def _shown(entry: Entry, step: str) -> AbstractContextManager[Counting]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,7 +42,7 @@ class Scan(Command):
         """Scan, write both files, and list the segments."""
         from ..prepare.scan import scan_video
         from ..prepare.scan_figure import draw_scan
-        from ..prepare.segments import as_json, best_segment, segments_of, stretches_of
+        from ..prepare.segments import as_json, best_segment, from_json, segments_of
         from ..system.atomic import write_json
 
         if self.out.suffix.lower() != ".json":
@@ -51,11 +50,12 @@ class Scan(Command):
         require_writable_folder("OUT.json", self.out.parent)
         with Counting() as progress:
             scan = scan_video(self.video, self.folder_rate, lambda done, whole: progress("scan", int(done), int(whole)))
-        stretches = stretches_of(scan)
+        scanned = as_json(scan)
+        stretches = from_json(scanned)
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(self.out, as_json(scan, stretches))
+        write_json(self.out, scanned)
         figure = self.out.with_suffix(".png")
-        draw_scan(self.video, scan, stretches, figure, self.folder_rate)
+        draw_scan(self.video, scanned, figure, self.folder_rate)
         segments = segments_of(stretches)
         unusable = sum(each.seconds for each in stretches if each.reason)
         say(f"{self.video}: {scan.seconds:.1f} s, {len(segments)} segments; {unusable:.1f} s are in none")

@@ -25,7 +25,7 @@ FLOOR_WEIGHT = 0.1  # a disturbed image keeps at least this weight: its pose may
 
 
 def disturbances(
-    seconds: NDArray[np.float64], measured: Sequence[FrameQuality], scene: NDArray[np.int64]
+    seconds: NDArray[np.float64], measured: Sequence[FrameQuality], scene: NDArray[np.integer]
 ) -> tuple[list[str], NDArray[np.float64]]:
     """A word for what is wrong with each image, empty for nothing, and how far it is to be believed, in [0, 1].
 
@@ -54,7 +54,7 @@ def disturbances(
     return words, weights
 
 
-def scenes_outside(measured: Sequence[FrameQuality], scene: NDArray[np.int64]) -> set[int]:
+def scenes_outside(measured: Sequence[FrameQuality], scene: NDArray[np.integer]) -> set[int]:
     """The scenes that show no inside of a body, as far as that is sure.
 
     Color alone does not tell: tissue can be gray or blue. It must also differ from the rest of the clip, and vary.

@@ -39,8 +39,7 @@ def small_size(width: int, height: int) -> tuple[int, int]:
 
 
 def view_mask(images: Sequence[Image]) -> Mask:
-    """(h, w) True where some image (h, w, 3) of a clip shows something, without the rim; everywhere if that is little.
-    """
+    """(h, w) True where some image (h, w, 3) of a clip shows something, without the rim; all True if that is little."""
     seen = np.max([_largest(image) for image in images], 0) > SEEN
     inside = cv2.erode(seen.astype(np.uint8), square(RIM_PX), borderType=cv2.BORDER_REPLICATE) > 0
     return inside if inside.mean() > 0.05 else np.ones_like(inside)

@@ -23,8 +23,9 @@ DISTINCT = 0.8  # a feature is found again if the second best candidate is farth
 class View:
     """One small gray image (h, w), see `frame_quality.small_size`, and its features once they are asked for."""
 
-    def __init__(self, gray: Image, inside: Mask) -> None:
-        self.gray, self._inside = gray, inside.astype(np.uint8)
+    def __init__(self, gray: Image, inside: Mask | None = None) -> None:
+        """Args: inside: (h, w) True where points may lie; None for everywhere."""
+        self.gray, self._inside = gray, None if inside is None else inside.astype(np.uint8)
 
     @cached_property
     def corners(self) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from ..data.sequence import is_test_frame
 from ..data.writer import FrameFiles, SequenceMeta, new_sequence
 from .camera import STILL, Eye
 from .config import PhantomConfig
+from .events import disturbed, is_mirrored, parse_events, shows_body
 from .scene import Moment, Scene, build_scene
 from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
 from .texture import smooth_patches
@@ -72,8 +74,8 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
       0 where the endoscope does not see the tissue; `truth/side/world_to_camera.json` has their poses (4, 4);
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
-    - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, and the density of smoke
-      in each frame, 0..1; `truth/tissue` shows the smoke too, the side cameras do not;
+    - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, events, and the density of
+      smoke in each frame, 0..1; `truth/tissue` shows the smoke too, the side cameras do not;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
 
     Args:
@@ -89,6 +91,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
         points, visible, gain, sides = [], [], 0.0, {}
+        events = parse_events(cfg.events, cfg.frames)
         ever_seen, behind_tools = np.zeros(scene.a.shape, bool), {}
         for index in range(cfg.frames):
             now = Moment.of(scene, index / (cfg.frames - 1))
@@ -104,11 +107,15 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             if cfg.stereo:
                 other = render_view(scene, now, Eye.moved(cfg.baseline_mm))
                 right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
-            writer.write_image("truth/tissue", np.round(develop(view.tissue, gain, lens)).astype(np.uint8))
-            writer.write_array(f"truth/depth/{index:06d}.npy", z)
+            depth = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
+            turned = slice(None, None, -1) if is_mirrored(events, index) else slice(None)
+            tissue = np.round(develop(view.tissue, gain, lens)).astype(np.uint8)
+            writer.write_image("truth/tissue", tissue[:, turned])
+            writer.write_array(f"truth/depth/{index:06d}.npy", z[:, turned])
             seen = visible_points(now.vertices, z, mask, cfg)
             points.append(now.vertices[tracked[:, 0], tracked[:, 1]])
-            visible.append(seen[tracked[:, 0], tracked[:, 1]])
+            is_clear = shows_body(events, index) and not is_mirrored(events, index)
+            visible.append(seen[tracked[:, 0], tracked[:, 1]] & is_clear)
             if is_test_frame(index):
                 behind_tools[index] = np.packbits(mask)
                 for name, eye in sides.items():
@@ -117,7 +124,10 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
                     writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
             else:
                 ever_seen |= seen
-            writer.add(image, mask, stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng), right)
+            image, mask, depth = (np.ascontiguousarray(each[:, turned]) for each in (image, mask, depth))
+            if not shows_body(events, index):
+                mask, depth = np.zeros_like(mask), np.zeros_like(depth)
+            writer.add(disturbed(image, events, index, cfg.seed), mask, depth, right)
             if progress is not None:
                 progress(index + 1, cfg.frames)
         for index, packed in behind_tools.items():  # what is seen later is known only now
@@ -158,6 +168,8 @@ def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye])
     if cfg.has_kinds:
         tools = [tool.name for tool in scene.instruments]
         described: dict[str, object] = {"instruments": cfg.instruments, "tools": tools, "tissue": cfg.tissue}
+        if cfg.events:
+            described["events"] = [asdict(event) for event in parse_events(cfg.events, cfg.frames)]
         if scene.smoke is not None:
             described["smoke"] = [round(scene.smoke.density(k / (cfg.frames - 1)), 4) for k in range(cfg.frames)]
         writer.write_json("truth/scene.json", described)

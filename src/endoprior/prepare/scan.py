@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..footage.components import runs
 from ..footage.disturbances import disturbances, scenes_outside
 from ..footage.frame_quality import FrameQuality, measure_quality, small_size, view_mask
 from ..footage.same_view import Link, View, feature_link, flow_link
@@ -95,7 +96,7 @@ def scan_video(
 def _judged(looks: list[Look], is_cut: NDArray[np.bool_], same: NDArray[np.bool_], rate: float) -> list[Look]:
     """The looks with what is wrong with each. Args: same: whether a look repeats the one before."""
     seconds, measured = np.array([look.seconds for look in looks]), [look.quality for look in looks]
-    scene = np.cumsum(is_cut)
+    scene = np.cumsum(is_cut, dtype=np.int64)
     words, weights = disturbances(seconds, measured, scene)
     outside = scenes_outside(measured, scene)
     for i in range(len(looks)):
@@ -112,12 +113,6 @@ def _judged(looks: list[Look], is_cut: NDArray[np.bool_], same: NDArray[np.bool_
         Look(look.seconds, look.quality, look.link, word, float(weight))
         for look, word, weight in zip(looks, words, weights, strict=True)
     ]
-
-
-def runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """(first, end) of each stretch of True values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def _inside(source: Source, size: tuple[int, int]) -> NDArray[np.bool_]:

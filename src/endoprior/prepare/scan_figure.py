@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -10,23 +11,25 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ..system.atomic import whole_file
-from .scan import Scan
-from .segments import WORDS, Stretch, best_segment, segments_of
+from .segments import WORDS, best_segment, from_json, segments_of
 from .source import open_source
 
 PICTURES = 8
 GOOD, BEST = "#8fc98f", "#2e8b57"
-COLORS = dict(zip(WORDS, ("#9e9e9e", "#c9a227", "#222222", "#f2d16b", "#4a78b5", "#b58ad1", "#d62728", "#e0c9c9"), strict=True))
+COLORS: dict[str, str] = dict(
+    zip(WORDS, ("#9e9e9e", "#c9a227", "#222222", "#f2d16b", "#4a78b5", "#b58ad1", "#d62728", "#e0c9c9"), strict=True)
+)
 CURVES = ("brightness", "contrast", "focus", "floor", "overexposed")
 
 
-def draw_scan(video: Path, scan: Scan, stretches: list[Stretch], path: Path, folder_rate: float = 25.0) -> None:
-    """Write the timeline of a scanned video as a PNG file, completely or not at all."""
+def draw_scan(video: Path, scanned: dict[str, Any], path: Path, folder_rate: float = 25.0) -> None:
+    """Write the timeline of a video as a PNG file, completely or not at all. Args: scanned: what `scan.json` holds."""
+    stretches, whole, looks = from_json(scanned), scanned["seconds"], scanned["looks"]
     # Use a canvas directly: selecting a Matplotlib backend would change the whole process.
     figure = Figure(figsize=(15, 8), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
-    top, bottom = figure.subfigures(2, 1, height_ratios=[1, 3])
-    pictures = open_source(video, folder_rate).glimpses(0.0, scan.seconds, PICTURES)
+    top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 3]).flat
+    pictures = open_source(video, folder_rate).glimpses(0.0, whole, PICTURES)
     for axis in np.atleast_1d(top.subplots(1, PICTURES)):
         axis.set_axis_off()
     for axis, image in zip(top.axes, pictures, strict=False):
@@ -38,29 +41,29 @@ def draw_scan(video: Path, scan: Scan, stretches: list[Stretch], path: Path, fol
         is_best = best >= 0 and stretch is segments[best]
         color = COLORS[stretch.reason] if stretch.reason else BEST if is_best else GOOD
         bar.axvspan(stretch.start, stretch.end, color=color, linewidth=0)
-        if not stretch.reason and stretch.seconds > 0.02 * scan.seconds:
+        if not stretch.reason and stretch.seconds > 0.02 * whole:
             middle, number = (stretch.start + stretch.end) / 2, segments.index(stretch) + 1
             bar.text(middle, 0.5, str(number), ha="center", va="center", fontsize=9)
-    for cut in scan.cuts:
+    for cut in scanned["cuts"]:
         bar.axvline(cut, color=COLORS["scene change"], linewidth=0.8)
     used = [word for word in WORDS if any(stretch.reason == word for stretch in stretches)]
     shown = [Patch(color=BEST, label="best segment"), Patch(color=GOOD, label="segments")]
     shown += [Patch(color=COLORS[word], label=word) for word in used]
-    if scan.cuts and "scene change" not in used:
+    if scanned["cuts"] and "scene change" not in used:
         shown.append(Patch(color=COLORS["scene change"], label="scene change"))
     bar.legend(handles=shown, ncols=len(shown), loc="lower left", bbox_to_anchor=(0, 1), fontsize=8, frameon=False)
     bar.set_yticks([])
-    seconds = [look.seconds for look in scan.looks]
     for name in CURVES:
-        values = np.array([getattr(look.quality, name) for look in scan.looks])
+        values = np.array(looks[name], np.float64)
         scale = 1.0 if name in ("brightness", "overexposed") else max(float(np.percentile(values, 98)), 1e-6)
-        curves.plot(seconds, values / scale, linewidth=0.9, label=name if scale == 1 else f"{name} (of its most)")
+        curves.plot(
+            looks["seconds"], values / scale, linewidth=0.9, label=name if scale == 1 else f"{name} (of its most)"
+        )
     curves.set_ylim(0, 1.3)
     curves.legend(ncols=len(CURVES), loc="upper left", fontsize=8, frameon=False)
-    shifts = [np.nan if look.link is None else 100 * look.link.shift for look in scan.looks]
-    motion.plot(seconds, shifts, ".", markersize=2)
+    motion.plot(looks["seconds"], 100 * np.array(looks["shift"], np.float64), ".", markersize=2)
     motion.set_ylabel("motion, % of width")
     motion.set_xlabel("s (no point: motion unknown)")
-    motion.set_xlim(0, max(scan.seconds, 1e-3))
+    motion.set_xlim(0, max(whole, 1e-3))
     with whole_file(path) as temporary:
         figure.savefig(temporary)

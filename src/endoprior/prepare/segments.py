@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from .scan import Look, Scan, runs
+from ..footage.components import runs
+from .scan import Look, Scan
 
 SHORTEST_S = 1.0  # a segment is at least so long, s
 TOLERATED_S = 0.5  # a disturbance that is shorter does not end a segment, s
 LONGEST_S = 30.0  # most of a segment that counts, and that is used unless it is the whole video, s
 UNKNOWN_MOTION = 0.5  # how far an image counts whose motion is unknown
 CUT, SHORT = "scene change", "too short"
-WORDS = ("smoke", "blur", "dark", "overexposed", "out of the body", "repeated frames", CUT, SHORT)
+WORDS: tuple[str, ...] = ("smoke", "blur", "dark", "overexposed", "out of the body", "repeated frames", CUT, SHORT)
 """What keeps a stretch from being a segment."""
 
 
@@ -102,15 +103,18 @@ def _segment(looks: list[Look], edges: list[float]) -> Stretch:
     lasts = np.diff(edges)
     known = np.array([look.link is not None for look in looks])
     known[:1] = True  # the first image follows nothing
-    worth = np.concatenate([[0.0], np.cumsum(lasts * [look.weight for look in looks] * np.where(known, 1, UNKNOWN_MOTION))])
+    worth = np.concatenate(
+        [[0.0], np.cumsum(lasts * [look.weight for look in looks] * np.where(known, 1, UNKNOWN_MOTION))]
+    )
     ends = np.searchsorted(edges, np.array(edges) + LONGEST_S + 1e-6, side="right") - 1
     scores = worth[ends] - worth
     first = int(np.argmax(np.round(scores, 2)))
     return Stretch(edges[0], edges[-1], "", float(scores[first]), (edges[first], edges[ends[first]]))
 
 
-def as_json(scan: Scan, stretches: list[Stretch]) -> dict[str, Any]:
+def as_json(scan: Scan) -> dict[str, Any]:
     """What `scan.json` holds."""
+    stretches = stretches_of(scan)
     segments = segments_of(stretches)
     return {
         "format_version": 1,
@@ -142,3 +146,10 @@ def as_json(scan: Scan, stretches: list[Stretch]) -> dict[str, Any]:
             },
         },
     }  # fmt: skip
+
+
+def from_json(scanned: dict[str, Any]) -> list[Stretch]:
+    """The stretches of a video, in order, from what `as_json` gave."""
+    good = [Stretch(each["start"], each["end"], "", each["score"], tuple(each["used"])) for each in scanned["segments"]]
+    bad = [Stretch(each["start"], each["end"], each["reason"]) for each in scanned["not_usable"]]
+    return sorted(good + bad, key=lambda each: each.start)
