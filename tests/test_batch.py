@@ -19,6 +19,8 @@ from endoprior.runs.remote import Trained, Training
 from endoprior.system.devices import Threads
 from endoprior.system.ray_cluster import Ended
 
+METRICS = '{"scores": {"psnr_tissue": 30.25, "odd": 1}, "verdict": {"word": "usable", "reasons": ["30 dB"]}}'
+
 
 def entry(name: str, out: Path) -> Entry:
     return Entry(name, SequenceJob(Path(name), out / name, tiny_config("basis")))
@@ -32,7 +34,7 @@ def fake_steps(monkeypatch):
     def act(job, progress):
         if job.out.name in fails:
             raise fails[job.out.name]
-        (job.run / "metrics.json").write_text('{"scores": {"psnr_tissue": 30.25, "odd": 1}}')
+        (job.run / "metrics.json").write_text(METRICS)
         return []
 
     def first(job, progress):
@@ -71,7 +73,8 @@ def test_a_failed_job_does_not_stop_the_others_and_is_tried_again(fake_steps, tm
     assert [outcome.failure for outcome in outcomes] == reasons
     assert "Traceback" in (tmp_path / "b/failure.txt").read_text() and not (tmp_path / "a/failure.txt").exists()
     lines = write_summary(outcomes, tmp_path)
-    assert lines[2] == "| c | 30.25 dB |" and lines[-2:] == [f"- {n}: {r}" for n, r in zip("ab", reasons, strict=False)]
+    assert lines[2] == "| c | usable | 30.25 dB |"
+    assert lines[-2:] == [f"- {n}: {r}" for n, r in zip("ab", reasons, strict=False)]
     assert (tmp_path / "scores.csv").read_text() == "name,psnr_tissue,odd\nc,30.25,1\n"
     fake_steps.clear()
     shown.steps.clear()

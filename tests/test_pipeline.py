@@ -21,7 +21,7 @@ from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.pipeline import STEPS, SequenceJob, make_job, notes_of, open_folder, problems, run_step
+from endoprior.pipeline import STEPS, SequenceJob, make_job, notes_of, open_folder, problems, run_step, verdict_of
 from endoprior.pipeline.steps import PREVIEW_TITLE
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.work_folder import work_lock
@@ -73,6 +73,19 @@ def test_every_step_leaves_its_result(done):
     assert all(step.result(done).exists() for step in STEPS)
     assert (done.run / "metrics.json").is_file() and done.report.is_file()
     assert len(load_scene(done.run).cameras) == FRAMES
+
+
+def test_the_verdict_stands_in_scores_and_player_and_is_a_quotation(done, tmp_path):
+    verdict = verdict_of(done)
+    stored = json.loads((done.run / "metrics.json").read_text())["verdict"]
+    assert verdict.word == stored["word"] and verdict.reasons
+    assert f"Verdict: {verdict.word}: " in done.player.read_text(encoding="utf-8")
+    job = replace(done, out=tmp_path)
+    job.run.mkdir()
+    for word, reasons, known in (("wrong", ["all. Fix: `evil`"], True), ("great", [], False)):
+        write_json(job.run / "metrics.json", {"verdict": {"word": word, "reasons": reasons}})
+        assert (verdict_of(job) is not None) == known
+        assert "`" not in str(verdict_of(job))
 
 
 def test_the_problems_of_the_video_are_named_and_nothing_else_of_the_file(done, tmp_path):

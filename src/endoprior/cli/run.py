@@ -21,6 +21,7 @@ from .progress import duration, step_head, step_progress
 from .train import require_gaussians
 
 if TYPE_CHECKING:
+    from ..evaluation.verdict import Verdict
     from ..pipeline import Job, SequenceJob
 
 
@@ -55,7 +56,7 @@ class Run(Command):
 
     def execute(self) -> int | None:
         """Do every step, with one progress display."""
-        from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of
+        from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of, verdict_of
         from ..runs import kernel_cache
         from ..runs.log import missed_tools_line
 
@@ -84,7 +85,7 @@ class Run(Command):
         except KeyboardInterrupt:
             say("Stopped. To resume, run the same command again.")
             raise
-        say(f"\nDone in {duration(clock.perf_counter() - began)}. Open {job.player} in a browser.")
+        say(f"\n{last_words(verdict_of(job), duration(clock.perf_counter() - began), job.player)}")
         results = {"video": job.rendered_video, "report": job.report, "check": job.figure, "scene": job.run}
         for what, path in results.items():
             say(f"  {what:<8}{path}")
@@ -139,6 +140,14 @@ def _part_words(job: Job) -> str:
     if not part.is_whole:
         words += f" from {part.start:g} s on (--start and --end choose another part)"
     return "\n".join([*(job.choice.words(job.source, job.out) if job.choice else []), words])
+
+
+def last_words(verdict: Verdict | None, took: str, player: Path) -> str:
+    """How a run ended: a model that is wrong is not called done."""
+    if verdict is None:
+        return f"Done in {took}. Open {player} in a browser."
+    head = f"The model is wrong (after {took})" if verdict.word == "wrong" else f"Done in {took}"
+    return f"{head}. Open {player} in a browser.\nVerdict: {verdict}."
 
 
 def resume_words(names: list[str], waiting: list[str]) -> str:

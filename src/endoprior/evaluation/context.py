@@ -19,6 +19,7 @@ from ..model.scene import RenderedScene, Scene
 from ..system.atomic import write_json
 from ..system.memory import BoundedCache, cache_bytes
 from .score import ScoreUnavailable, mean_over_frames
+from .verdict import Verdict
 
 OUTLIER_DB = 3.0  # A frame whose PSNR lies this far below the median of its split is an outlier
 EXACT = "infinite: the rendered frames equal the true ones exactly"
@@ -134,6 +135,8 @@ class Evaluation:
     """One row for each frame of the split: `index`, `time`, and the scores that a single frame has."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where rendered images come from, for `metrics.json`; a scene has its `config.json`."""
+    verdict: Verdict | None = None
+    """How good the model is, in a word, with its reasons."""
     protocols: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By name of another paper's protocol: its `tags`, `scores` and `skipped`; see `protocols.score_protocols`."""
 
@@ -155,6 +158,8 @@ class Evaluation:
         suffix = "" if self.protocol["split"] == "test" else f"_{self.protocol['split']}"
         file = folder / f"metrics{suffix}.json"
         facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
+        if self.verdict is not None:
+            facts["verdict"] = {"word": self.verdict.word, "reasons": list(self.verdict.reasons)}
         write_json(file, facts | ({"protocols": self.protocols} if self.protocols else {}) | self.provenance)
         write_json(folder / f"per_frame{suffix}.json", self.per_frame)
         return file

@@ -23,6 +23,7 @@ SCORERS = (
     "other_views",
     "tracks",
     "camera_path",
+    "references",
     "model",
 )
 """Modules of `scorers/`, in the order in which they run. Each has `SCORES` and `compute(context)`."""

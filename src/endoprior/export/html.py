@@ -71,7 +71,13 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
 
 
 def write_html(
-    scene: Scene, out: Path, *, title: str = "", times: list[float] | None = None, max_bytes: int = 20_000_000
+    scene: Scene,
+    out: Path,
+    *,
+    title: str = "",
+    remark: str = "",
+    times: list[float] | None = None,
+    max_bytes: int = 20_000_000,
 ) -> Path:
     """Write a single-file player of `scene`: a web page that opens from disk and needs nothing else.
 
@@ -83,6 +89,7 @@ def write_html(
     Args:
         out: file to write; an existing one is replaced, and missing folders are created.
         title: at the top of the page and in the browser's tab.
+        remark: a line below it, such as how good the scene is.
         times: T times in [0, 1], increasing; None: those of the frames.
         max_bytes: largest size of the file.
     Returns:
@@ -124,7 +131,7 @@ def write_html(
         "blocks": blocks,
     }
     unit = length_unit(scene.lengths_are_relative)
-    page = _page(title or DEFAULT_TITLE, unit, about, b"".join(streams)).encode()
+    page = _page(title or DEFAULT_TITLE, remark, unit, about, b"".join(streams)).encode()
     if len(page) > max_bytes:
         raise _too_large(out, max_bytes, len(page), len(times), num_shown.max())
     with whole_file(out) as temporary:
@@ -155,12 +162,13 @@ def _about(scene: Scene, times: list[float]) -> dict[str, Any]:
     }
 
 
-def _page(title: str, unit: str, about: dict[str, Any], data: bytes) -> str:
+def _page(title: str, remark: str, unit: str, about: dict[str, Any], data: bytes) -> str:
     def read(name: str) -> str:
         return (PLAYER / name).read_text(encoding="utf-8")
 
     parts = {
         "TITLE": html.escape(title),
+        "REMARK": f'<p id="remark">{html.escape(remark)}</p>' if remark else "",
         "STYLE": read("player.css"),
         "UNIT": unit,
         "ABOUT": json.dumps(about, allow_nan=False).replace("<", "\\u003c"),

@@ -2,7 +2,7 @@
 
 from .batch import SUMMARY, TABLE, Entry, Outcome, run_here, run_on, write_summary
 from .job import Job, SequenceJob, make_job, open_folder, removed_if_rejected
-from .steps import STEPS, Step, notes_of, problems, run_step, steps_of
+from .steps import STEPS, Step, notes_of, problems, run_step, steps_of, verdict_of
 
 __all__ = [
     "STEPS",
@@ -22,5 +22,6 @@ __all__ = [
     "run_on",
     "run_step",
     "steps_of",
+    "verdict_of",
     "write_summary",
 ]

@@ -23,7 +23,7 @@ from ..system.atomic import write_text
 from ..system.devices import Threads
 from ..system.ray_cluster import Cluster
 from .job import SequenceJob, open_folder
-from .steps import SHOWN_SCORES, run_step, start_training, steps_of
+from .steps import SHOWN_SCORES, run_step, start_training, steps_of, verdict_of
 
 FAILURE = "failure.txt"  # in the folder of a job: the traceback, if it failed by an error of the program
 SUMMARY, TABLE = "summary.md", "scores.csv"
@@ -173,11 +173,12 @@ def write_summary(outcomes: Sequence[Outcome], out: Path) -> list[str]:
     known = [all_scores()[name] for name in SHOWN_SCORES if any(name in found for found in scores.values())]
     lines = []
     if done:
-        lines = [f"| | {' | '.join(score.label for score in known)} |", f"|---|{'---|' * len(known)}"]
+        lines = [f"| | verdict | {' | '.join(score.label for score in known)} |", f"|---|---|{'---|' * len(known)}"]
     for entry in done:
         relative, found = load_sequence(entry.job.data, entry.job.cfg.data).depth_is_relative, scores[entry.name]
         cells = [score.text(found[score.name], relative) if score.name in found else "" for score in known]
-        lines.append(f"| {entry.name} | {' | '.join(cells)} |")
+        verdict = verdict_of(entry.job)
+        lines.append(f"| {entry.name} | {verdict.word if verdict else ''} | {' | '.join(cells)} |")
     if failed := [outcome for outcome in outcomes if outcome.failure]:
         lines += ([""] if done else []) + ["Failed:", ""]
         lines += [f"- {outcome.entry.name}: {outcome.failure}" for outcome in failed]

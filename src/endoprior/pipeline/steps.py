@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from ..data.description import read_description
 from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
+from ..evaluation.verdict import WORDS, Facts, Verdict, verdict_on
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
 from ..footage.components import runs
 from ..model.scene import RenderedScene, Scene
@@ -31,7 +33,7 @@ from ..prepare import prepare
 from ..prepare.pipeline import Progress
 from ..prepare.scan_figure import draw_scan
 from ..runs.folder import CHECKPOINT, CONFIG
-from ..runs.log import mask_facts
+from ..runs.log import mask_facts, missed_tools_of
 from ..runs.report import write_report
 from ..runs.train import TrainingRun, WindowedRun, start_run
 from ..system.atomic import write_json
@@ -43,6 +45,7 @@ from .job import Job, SequenceJob
 
 PLAYER_BYTES = 40_000_000  # largest player
 LEAST_BYTES = 7  # size of one Gaussian at one time step in the player; at least this (docs/export.md)
+TITLE_LETTERS = 150  # in a line above the report
 PREVIEW_TITLE = "Preview: small frames, short training. Not for scores."
 CODE = re.compile("[a-z]+(-[a-z]+)*")  # names of findings
 LOST_FRAMES = 5  # so many frames in a row without a pose: the camera is lost. Fewer are blurred or covered.
@@ -146,11 +149,24 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
     sequence = _frames_of(job, scene.config)
     result = evaluate(scene, sequence, networks=False)
     result.protocol |= mask_facts(job.run)
+    missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
+    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative)
+    result.verdict = verdict_on(result.scores, facts)
     result.save(job.run)
-    write_report(scene, sequence, job.run, job.report, PREVIEW_TITLE if job.is_preview else "")
+    title = [PREVIEW_TITLE] * job.is_preview + wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)
+    write_report(scene, sequence, job.run, job.report, "\n".join(title))
     known = [all_scores()[name] for name in SHOWN_SCORES if name in result.scores]
     shown = [f"{score.label} {score.text(result.scores[score.name], sequence.depth_is_relative)}" for score in known]
     return [f"held-out frames: {', '.join(shown)}"]
+
+
+def verdict_of(job: SequenceJob) -> Verdict | None:
+    """The verdict on the model of a job; None of one that an earlier version made."""
+    file = job.run / "metrics.json"
+    stored = read_json(file).get("verdict") if file.is_file() else None
+    if not isinstance(stored, dict) or stored.get("word") not in WORDS:
+        return None
+    return Verdict(stored["word"], tuple(quotation(str(reason)) for reason in stored.get("reasons", [])))
 
 
 def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
@@ -189,9 +205,11 @@ def _player(job: SequenceJob, progress: Progress) -> list[str]:
 
     times = shown(PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video
+    verdict = verdict_of(job)
+    remark = f"Verdict: {verdict}" if verdict else ""
     while not job.player.exists():
         try:
-            write_html(scene, job.player, title=title, times=times, max_bytes=PLAYER_BYTES)
+            write_html(scene, job.player, title=title, remark=remark, times=times, max_bytes=PLAYER_BYTES)
         except PageTooLarge as error:  # its size is known only when part of it is packed
             if len(times) == 1:
                 raise

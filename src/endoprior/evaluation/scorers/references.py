@@ -1,0 +1,183 @@
+"""What a model is worth beside simple references made from the video alone; what the verdict on a run rests on.
+
+A number of dB says little of a video that was never modelled before: how hard it is, the references tell. `P` points.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.geometry import back_project, project
+from ...core.ranges import spread
+from ...core.types import Camera, Frame
+from ...data import FrameList, FrameSequence
+from ...footage.components import Mask
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_both_ways, gray_for_flow
+from ...model.carry import carry_points
+from ...model.scene import Scene
+from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
+from ..context import EvaluationContext
+from ..score import ScoreUnavailable, scores_from
+from .image import psnr_tissue
+
+SCORES = scores_from("""
+    gain_over_flow | above the moved frame | dB | higher | 2 | absolute | image | -
+        Tissue PSNR minus that of the nearest training frame, moved by optical flow (DIS) to the held-out one.
+    gain_over_mean | above the mean image | dB | higher | 2 | absolute | image | -
+        Tissue PSNR minus that of the mean of all training frames.
+    slip_px | slip against the flow | px | lower | 2 | relative | motion | -
+        Median distance, after 12 frames, between where the scene and where chained flow carries tissue; 640 px wide.
+    depth_triangulated_error | depth against triangulation |  | lower | 3 | relative | depth | -
+        Median relative difference between rendered depth and that of points triangulated with the scene's cameras.
+""")
+MEAN_FRAMES = 60  # training frames in the mean image
+STARTS, AHEAD, GRID = 6, 12, 16
+"""Frames from which points are followed, for so many frames, and the number of points along the wider side."""
+HALF = np.float32(0.5)  # OpenCV counts pixels from the center of the first one, we from its edge
+RETURN_PX = 1.0  # a point that comes back by less is followed rightly
+REFERENCE_WIDTH_PX = 640
+LEAST_ANGLE = math.radians(1.5)  # rays that meet at a smaller angle do not tell depth
+MOST_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, are not of one resting point
+LEAST_POINTS = 40
+FEW_POINTS = "too few points could be followed on tissue"
+STANDS = "the camera stands still"
+
+
+def compute(context: EvaluationContext) -> None:
+    """Compare rendered frames of the split, carried points and depth with what the video says."""
+    with context.skip_if_unavailable("gain_over_flow", "gain_over_mean"):
+        _image_references(context)
+    with context.skip_if_unavailable("slip_px", "depth_triangulated_error"):
+        _point_references(context, context.scene)
+
+
+def _image_references(context: EvaluationContext) -> None:
+    training, rows = context.sequence.frames("train"), []
+    if not len(training):
+        raise ScoreUnavailable("there is no training frame")
+    average = mean_image(training)
+    for frame in context.frames:
+        mask, row = frame.tissue_mask, dict[str, float]()
+        image, (moved, known) = context.rendered[frame.index].rgb, moved_frame(training, frame)
+        row["gain_over_flow"] = psnr_tissue(image, frame.rgb, mask & known) - psnr_tissue(
+            moved, frame.rgb, mask & known
+        )
+        row["gain_over_mean"] = psnr_tissue(image, frame.rgb, mask) - psnr_tissue(average, frame.rgb, mask)
+        rows.append(row)
+    context.add_frames(rows, "no tissue in the split")
+
+
+def mean_image(frames: FrameList) -> NDArray[np.float32]:
+    """(H, W, 3) mean color in [0, 1] of up to `MEAN_FRAMES` frames over their tissue; of all pixels where none is."""
+    chosen = [frames[k] for k in spread(len(frames), MEAN_FRAMES)]
+    weight, tissue, every = np.zeros_like(chosen[0].rgb[..., :1]), *np.zeros((2, *chosen[0].rgb.shape), np.float32)
+    for frame in chosen:
+        mask = frame.tissue_mask[..., None]
+        weight += mask
+        tissue += frame.rgb * mask
+        every += frame.rgb
+    return np.where(weight > 0, tissue / np.maximum(weight, 1), every / np.float32(len(chosen)))
+
+
+def moved_frame(training: FrameList, frame: Frame) -> tuple[NDArray[np.float32], Mask]:
+    """The nearest training frame, moved to a frame by the flow between both: (H, W, 3) color; (H, W) True where it is
+    tissue. Pixels that it does not show come from the nearest one on the other side.
+    """
+    height, width = frame.tissue_mask.shape
+    if min(height, width) < MIN_SIZE_PX:
+        raise ScoreUnavailable(f"frames are smaller than {MIN_SIZE_PX} px, the least for optical flow")
+    order = sorted(range(len(training)), key=lambda k: abs(training.indices[k] - frame.index))[:2]
+    color, known = np.zeros_like(frame.rgb), np.zeros_like(frame.tissue_mask)
+    shrink = fine_shrink(height, width)
+    now = gray_for_flow(frame.rgb_u8, shrink)
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    for k in order:
+        other = training[k]
+        flow = cv2.resize(fine_flow(now, gray_for_flow(other.rgb_u8, shrink)), (width, height))
+        scale = np.float32(width / now.shape[1]), np.float32(height / now.shape[0])
+        at = x + flow[..., 0] * scale[0], y + flow[..., 1] * scale[1]
+        tissue = cv2.remap(other.tissue_mask.astype(np.float32), *at, cv2.INTER_LINEAR) > 0.999
+        new = tissue & ~known
+        color[new] = cv2.remap(other.rgb, *at, cv2.INTER_LINEAR)[new]
+        known |= tissue
+    return color, known
+
+
+def _point_references(context: EvaluationContext, scene: Scene) -> None:
+    sequence = context.sequence
+    ahead = min(AHEAD, len(sequence) - 1)
+    slips, errors = list[NDArray](), list[NDArray]()
+    for k in spread(len(sequence) - ahead, STARTS):
+        followed = follow(sequence, k, ahead)
+        if not len(followed.start):
+            continue
+        camera, time = sequence.camera(k), k / len(sequence)
+        surface = render_surface(scene, time, camera)
+        depth = depth_at(surface, followed.start)
+        good = np.isfinite(depth) & (depth > 0)
+        start, end, depth = followed.start[good], followed.end[good], depth[good]
+        last = sequence.camera(k + ahead)
+        points = back_project(start, depth, camera)
+        carried = carry_points(scene, points, np.zeros(len(points), np.intp), [time, (k + ahead) / len(sequence)])[1]
+        pixels, seen = project_visible(carried, render_surface(scene, (k + ahead) / len(sequence), last))
+        gap = np.linalg.norm(pixels - end, axis=1) * REFERENCE_WIDTH_PX / last.width
+        slips.append(gap[seen])
+        true, told = triangulated(start, end, camera, last)
+        errors.append(np.abs(true[told] / depth[told] - 1))
+    for name, values, why in (
+        ("slip_px", slips, FEW_POINTS),
+        ("depth_triangulated_error", errors, f"{STANDS}, or {FEW_POINTS}"),
+    ):
+        found = np.concatenate(values) if values else np.zeros(0)
+        context.add(name, float(np.median(found)) if len(found) >= LEAST_POINTS else math.nan, why)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Points on tissue that flow follows from one frame to a later one and back."""
+
+    start: NDArray[np.float32]  # (P, 2) px
+    end: NDArray[np.float32]  # (P, 2) px
+
+
+def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
+    """Points of a grid on the tissue of a frame, followed from frame to frame for `ahead` frames."""
+    frame = sequence.frame(first)
+    height, width = frame.tissue_mask.shape
+    step = width / GRID
+    at = np.stack(np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step)), -1).reshape(-1, 2)
+    now = start = (at - HALF).astype(np.float32)
+    gray = gray_for_flow(frame.rgb_u8, 1)
+    kept = shown_pixels(now + HALF, frame.tissue_mask)
+    for index in range(first + 1, first + ahead + 1):
+        frame = sequence.frame(index)
+        following = gray_for_flow(frame.rgb_u8, 1)
+        now, returned = follow_both_ways(gray, following, now, RETURN_PX)
+        kept &= returned & shown_pixels(now + HALF, frame.tissue_mask)
+        gray = following
+    return Followed(start[kept] + HALF, now[kept] + HALF)
+
+
+def triangulated(
+    start: NDArray[np.floating], end: NDArray[np.floating], first: Camera, last: Camera
+) -> tuple[NDArray[np.float64], Mask]:
+    """(P,) z in the first camera, mm, of points seen at `start` by it and at `end` by the last one, (P, 2) px: the
+    middle of where the two rays come nearest; and (P,) True where they meet, at an angle that tells the depth.
+    """
+    one = np.ones(len(start))
+    origins = first.center, last.center
+    rays = [back_project(pixels, one, camera) - camera.center for pixels, camera in ((start, first), (end, last))]
+    a, b = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    cosine, between = (a * b).sum(1), origins[1] - origins[0]
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    along = ((a @ between) - cosine * (b @ between)) / sine2
+    back = (cosine * (a @ between) - (b @ between)) / sine2
+    on_first, on_last = origins[0] + along[:, None] * a, origins[1] + back[:, None] * b
+    pixels, z = project((on_first + on_last) / 2, first)
+    meet = (along > 0) & (back > 0) & (z > 0) & (np.linalg.norm(pixels - start, axis=1) < MOST_GAP_PX)
+    return z, meet & (np.arccos(np.clip(cosine, -1, 1)) > LEAST_ANGLE)

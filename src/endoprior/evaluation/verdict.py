@@ -1,0 +1,113 @@
+"""How good a model is, in one of four words, and why: so that nothing wrong is ever called done.
+
+A rule looks at one piece of evidence and says how good the model can be at best. The worst rule decides; its words are
+the reason. Limits come from clips and phantoms of ten kinds whose models were looked at (docs/log.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Word = Literal["good", "usable", "doubtful", "wrong"]
+WORDS: tuple[Word, ...] = get_args(Word)
+"""From best to worst."""
+GOOD, USABLE, DOUBTFUL, WRONG = range(len(WORDS))
+OVER_FLOW_DB, TISSUE_DB = (-3.0, -6.0), (33.0, 28.0)
+"""Held-out frames are good, or usable, if their PSNR is near that of the nearest training frame moved by flow, or high.
+The moved frame is hard to beat: it has all texture, and the flow has seen the held-out frame."""
+BLURRED_DB = 28.0  # below, frames are so far off that they must at least beat simple references clearly:
+WRONG_OVER_MEAN_DB = 2.0  # the mean of all frames by this, else nothing was learned,
+FOLLOWED_DB = 3.0  # as the moved frame must, else not even flow follows this video
+LEAST_FRAMES = (0.8, 0.5)  # share of the frames that could be used
+SLIP_PX = (4.0, 10.0)
+DEPTH_ERROR = (0.15, 0.35)
+TOOLS_MISSED = (0.1, 0.4)  # share of the frames in which training found what looks like a missed tool
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the verdict needs beside scores."""
+
+    share_used: float = 1.0
+    """Share of the frames of the chosen part that were trained on or scored, 0..1."""
+    share_with_missed_tools: float = 0.0
+    depth_is_relative: bool = False
+    """Depth is guessed from one eye."""
+    motion_is_unknown: bool = False
+    """The camera moves, or may move, and its path was not found."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A word and its reasons, one line each; those that decided come first."""
+
+    word: Word
+    reasons: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.word}: {'; '.join(self.reasons)}"
+
+
+def verdict_on(scores: Mapping[str, float], facts: Facts) -> Verdict:
+    """The verdict on a model. Args: scores: of held-out frames, by name (docs/scores.md)."""
+    found = [*_images(scores), *_motion(scores, facts), *_depth(scores, facts), *_frames(facts)]
+    worst = max((level for level, _ in found), default=DOUBTFUL)
+    reasons = [reason for level, reason in found if level == worst]
+    if worst in (USABLE, GOOD):
+        return Verdict(WORDS[worst], tuple(reasons))
+    also = [reason for level, reason in found if USABLE <= level < worst]
+    return Verdict(WORDS[worst], (*reasons, *also))
+
+
+def _graded(value: float, limits: Sequence[float]) -> int:
+    """GOOD, USABLE or DOUBTFUL of a value that should be small; of one that should be large, negate both."""
+    return sum(value > limit for limit in limits)
+
+
+def _images(scores: Mapping[str, float]) -> Iterator[tuple[int, str]]:
+    """Whether held-out frames look as they should."""
+    if "psnr_tissue" not in scores:
+        yield DOUBTFUL, "no frame was held out to compare with"
+        return
+    tissue, told = scores["psnr_tissue"], f"held-out frames: {scores['psnr_tissue']:.1f} dB"
+    over_flow, over_mean = scores.get("gain_over_flow"), scores.get("gain_over_mean")
+    if over_flow is None or over_mean is None:
+        yield _graded(-tissue, [-limit for limit in TISSUE_DB]), told
+        return
+    if tissue < BLURRED_DB and over_mean < WRONG_OVER_MEAN_DB:
+        yield WRONG, f"{told}, hardly better than the mean of all frames ({tissue - over_mean:.1f} dB)"
+    elif tissue < BLURRED_DB and over_mean - over_flow < FOLLOWED_DB:
+        yield DOUBTFUL, f"{told}, and optical flow does not follow the video either"
+    else:
+        words = f"{abs(over_flow):.1f} dB {'above' if over_flow >= 0 else 'below'} the nearest frame moved by flow"
+        by_flow = _graded(-over_flow, [-limit for limit in OVER_FLOW_DB])
+        yield min(by_flow, _graded(-tissue, [-limit for limit in TISSUE_DB])), f"{told}, {words}"
+
+
+def _motion(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, str]]:
+    """Whether tissue goes where the video shows it going, and the camera where it went."""
+    if (slip := scores.get("slip_px")) is not None:
+        yield _graded(slip, SLIP_PX), f"tissue slips by {slip:.1f} px in 12 frames against the flow"
+    if facts.motion_is_unknown:
+        yield DOUBTFUL, "the camera moves and its path is unknown: depth and motion of tissue are mixed up"
+
+
+def _depth(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, str]]:
+    """Whether depth agrees with what the moving camera saw, or was measured by two."""
+    error = scores.get("depth_triangulated_error")
+    if error is not None:
+        yield _graded(error, DEPTH_ERROR), f"depth is {error:.0%} off what the moving camera triangulates"
+    elif facts.depth_is_relative:
+        yield USABLE, "depth is a guess from one eye that nothing confirms: do not trust views from the side"
+
+
+def _frames(facts: Facts) -> Iterator[tuple[int, str]]:
+    """Whether enough of the video could be used."""
+    if facts.share_used < 1:
+        least = [-limit for limit in LEAST_FRAMES]
+        yield _graded(-facts.share_used, least), f"only {facts.share_used:.0%} of the frames could be used"
+    if facts.share_with_missed_tools > 0:
+        share = facts.share_with_missed_tools
+        yield _graded(share, TOOLS_MISSED), f"a tool is likely missed in {share:.0%} of the frames"

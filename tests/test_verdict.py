@@ -1,0 +1,136 @@
+"""The references that the video gives, and the word that is said of a model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_surface import NORMAL, OFFSET, pose, seen, turned
+
+from endoprior.cli.run import last_words
+from endoprior.core.types import Camera, Frame
+from endoprior.evaluation.scorers.image import psnr_tissue
+from endoprior.evaluation.scorers.references import follow, mean_image, moved_frame, triangulated
+from endoprior.evaluation.verdict import Facts, Verdict, verdict_on
+
+WIDTH, HEIGHT = 160, 128
+MATRIX = np.array([[150.0, 0, 80], [0, 150.0, 64], [0, 0, 1]])
+GOOD_SCORES = {"psnr_tissue": 33.0, "gain_over_flow": -1.0, "gain_over_mean": 9.0, "slip_px": 1.0}
+
+
+class Clip:
+    """Frames of a painted plane from a camera that moves to the right, 0.4 mm a frame."""
+
+    def __init__(self, count: int = 14, step_mm: float = 0.4) -> None:
+        self.frames_, self.indices = [], list(range(count))
+        for k in range(count):
+            to_world = pose(turned(), (step_mm * k, 0, 0))
+            camera = Camera(WIDTH, HEIGHT, 150, 150, 80, 64, np.linalg.inv(to_world))
+            color, depth = seen(MATRIX, to_world, (WIDTH, HEIGHT))
+            tissue = np.ones((HEIGHT, WIDTH), bool)
+            self.frames_.append(Frame(k, k / count, camera, color, tissue, depth.astype(np.float32), depth > 0))
+
+    def __len__(self) -> int:
+        return len(self.frames_)
+
+    def __getitem__(self, k: int) -> Frame:
+        return self.frames_[k]
+
+    frame = __getitem__
+
+    def camera(self, k: int) -> Camera:
+        return self.frames_[k].camera
+
+
+def test_a_frame_moved_by_flow_is_nearly_the_one_it_is_moved_to():
+    clip = Clip()
+    held_out, training = clip[7], Clip()
+    training.indices, training.frames_ = [5, 10], [clip[5], clip[10]]
+    moved, known = moved_frame(training, held_out)
+    still = psnr_tissue(clip[5].rgb, held_out.rgb, known)
+    assert known.mean() > 0.9 and psnr_tissue(moved, held_out.rgb, known) > still + 6
+
+
+def test_a_tool_in_the_nearest_frame_is_filled_from_the_other_side():
+    clip = Clip()
+    covered = clip[6].tissue_mask.copy()
+    covered[40:80, 60:100] = False
+    clip.frames_[6] = replace(clip[6], tissue_mask=covered, rgb_u8=np.where(covered[..., None], clip[6].rgb_u8, 255))
+    clip.indices, clip.frames_ = [6, 9], [clip[6], clip[9]]
+    moved, known = moved_frame(clip, Clip()[7])
+    assert known[45:75, 65:95].all() and moved[45:75, 65:95].max() < 0.999
+    clip.indices, clip.frames_ = [6], [clip[0]]
+    alone, shown = moved_frame(clip, Clip()[7])
+    assert shown.mean() < known.mean()
+    np.testing.assert_array_equal(moved[shown], alone[shown])  # the farther frame fills in only
+
+
+def test_the_mean_image_is_over_tissue():
+    clip = Clip(2)
+    left = np.arange(WIDTH) < 40
+    clip.frames_[0] = replace(clip[0], tissue_mask=np.broadcast_to(~left, (HEIGHT, WIDTH)))
+    mean = mean_image(clip)
+    np.testing.assert_allclose(mean[:, left], clip[1].rgb[:, left], atol=1e-6)
+    np.testing.assert_allclose(mean[:, ~left], (clip[0].rgb + clip[1].rgb)[:, ~left] / 2, atol=1e-6)
+
+
+def test_followed_points_triangulate_to_the_plane():
+    clip = Clip()
+    followed = follow(clip, 0, 12)
+    assert len(followed.start) > 80 and (followed.start % 10 == 5).all()  # centers of the grid's cells
+    z, told = triangulated(followed.start, followed.end, clip.camera(0), clip.camera(12))
+    assert told.mean() > 0.8
+    rays = np.concatenate([(followed.start - (80, 64)) / 150, np.ones((len(z), 1))], 1)
+    true = OFFSET / (rays @ NORMAL)
+    assert np.median(np.abs(z / true - 1)[told]) < 0.02
+
+
+def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
+    camera = Clip(2).camera(0)
+    pixels = np.array([[20.0, 30.0], [90.0, 60.0]])
+    assert not triangulated(pixels, pixels + 3, camera, camera)[1].any()
+    nearly = replace(camera, world_to_camera=np.linalg.inv(pose(turned(), (0.5, 0, 0))))
+    assert not triangulated(pixels, pixels - (1, 0), camera, nearly)[1].any()  # rays meet at 0.4 degrees
+    beside = replace(camera, world_to_camera=np.linalg.inv(pose(turned(), (5.0, 0, 0))))
+    end = pixels - (10, 0)
+    assert triangulated(pixels, end, camera, beside)[1].all()
+    assert not triangulated(pixels, end + np.array([0, 6]), camera, beside)[
+        1
+    ].any()  # moved tissue: off the epipolar line
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts", "word", "reason"),
+    [
+        ({}, Facts(), "good", "1.0 dB below the nearest frame"),
+        ({"psnr_tissue": 29.0, "gain_over_flow": -5.0}, Facts(), "usable", "5.0 dB below"),
+        ({"psnr_tissue": 33.5, "gain_over_flow": -9.0}, Facts(), "good", "9.0 dB below"),
+        ({"psnr_tissue": 27.0, "gain_over_flow": -9.0}, Facts(), "doubtful", "9.0 dB below"),
+        ({"psnr_tissue": 25.0, "gain_over_mean": 0.9}, Facts(), "wrong", "the mean of all frames (24.1 dB)"),
+        ({"psnr_tissue": 25.0, "gain_over_mean": 2.5, "gain_over_flow": 0.5}, Facts(), "doubtful", "does not follow"),
+        # Nothing moves: the mean image is as good as anything, and being a little below it is not wrong.
+        ({"psnr_tissue": 34.0, "gain_over_flow": -1.5, "gain_over_mean": -0.5}, Facts(), "good", "1.5 dB below"),
+        ({"slip_px": 6.0}, Facts(), "usable", "slips by 6.0 px"),
+        ({"slip_px": 22.0}, Facts(), "doubtful", "slips by 22.0 px"),
+        ({"depth_triangulated_error": 0.05}, Facts(depth_is_relative=True), "good", "5% off"),
+        ({"depth_triangulated_error": 0.5}, Facts(), "doubtful", "50% off"),
+        ({}, Facts(depth_is_relative=True), "usable", "a guess from one eye"),
+        ({}, Facts(share_used=0.7), "usable", "70% of the frames"),
+        ({}, Facts(share_used=0.3), "doubtful", "30% of the frames"),
+        ({}, Facts(share_with_missed_tools=0.2), "usable", "missed in 20%"),
+        ({}, Facts(motion_is_unknown=True), "doubtful", "path is unknown"),
+    ],
+)
+def test_the_worst_evidence_decides(changes, facts, word, reason):
+    verdict = verdict_on(GOOD_SCORES | changes, facts)
+    assert verdict.word == word and reason in verdict.reasons[0] + " ".join(verdict.reasons)
+
+
+def test_without_a_held_out_frame_nothing_is_good():
+    assert verdict_on({}, Facts()).word == "doubtful"
+
+
+def test_what_is_wrong_is_not_called_done(tmp_path):
+    wrong, good = Verdict("wrong", ("worse",)), Verdict("good", ("33 dB",))
+    assert "Done" not in last_words(wrong, "2 min", tmp_path) and "wrong: worse" in last_words(wrong, "2 min", tmp_path)
+    assert last_words(good, "2 min", tmp_path).startswith("Done in 2 min.")
+    assert last_words(None, "2 min", tmp_path).startswith("Done in 2 min.")
