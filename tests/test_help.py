@@ -19,6 +19,7 @@ from endoprior.model.presets import preset
 
 MOST_LINES = 45
 VALUES = {
+    "--events": "blur:1-2",
     int: 1,
     float: 300,
     Path: "x",

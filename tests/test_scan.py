@@ -38,7 +38,7 @@ def test_every_event_is_found_at_its_frames_and_nothing_else(scan, disturbed):
     for word, first, last in (("blur", 12, 17), ("overexposed", 30, 37), ("out of the body", 60, 74)):
         assert np.flatnonzero(words == word).tolist() == list(range(first, last + 1)), word
     assert {*words} == {"", "blur", "overexposed", "out of the body"}
-    assert [round(time * RATE) for time in scan.cuts] == [60, 75, 90]
+    assert [round(time * RATE) for time in scan.cuts] == [90]
     weights = np.array([look.weight for look in scan.looks])
     assert ((weights < 1) == (words != "")).all()
 
@@ -49,7 +49,8 @@ def test_segments_are_what_lies_between_them(scan):
         ("", 0, 12), ("blur", 12, 18), ("", 18, 30), ("overexposed", 30, 38), ("", 38, 60),
         ("out of the body", 60, 75), ("", 75, 90), ("", 90, 110),
     ]  # fmt: skip
-    assert from_json(as_json(scan)) == pytest.approx(stretches_of(scan)) or from_json(as_json(scan))
+    stored = from_json(as_json(scan))
+    assert [(each.reason, each.start) for each in stored] == [(each.reason, each.start) for each in stretches_of(scan)]
 
 
 def test_the_longest_clear_segment_is_chosen_and_a_scan_is_kept(disturbed, tmp_path):

@@ -16,6 +16,7 @@ from ..prepare.config import PrepareConfig
 from ..system.console import say
 from .arguments import Command
 from .devices import Wanted, with_device
+from .jobs import do_all
 from .paths import require_writable_folder
 from .progress import duration, step_head, step_progress
 from .train import require_gaussians
@@ -100,7 +101,10 @@ class Run(Command):
         from ..pipeline import SequenceJob, make_job
 
         is_prepared = is_sequence(self.video)
-        if is_prepared and (useless := ["--preview"] * self.preview + list(changed_options(self.config))):
+        chosen = ["--segment"] * bool(self.segment) + ["--all-segments"] * self.all_segments
+        if chosen and (other := {"--start", "--end", "--stir"} & {*changed_options(self.config)}):
+            raise input_error(chosen[0], f"no {min(other)}", f"{chosen[0]} and {min(other)}", "Remove one of them.")
+        if is_prepared and (useless := ["--preview"] * self.preview + chosen + list(changed_options(self.config))):
             fix = f"Remove {useless[0]}{', or use `--preset preview`' * self.preview}."
             raise input_error(useless[0], "a video to prepare", f"{self.video}, a sequence folder", fix)
         cfg = replace(preset("preview" if self.preview else self.preset), seed=self.seed)
@@ -114,11 +118,12 @@ class Run(Command):
 
     def _run_all(self) -> int:
         """The segments one after the other, in folders of `out`; 1 if one failed."""
+        if is_sequence(self.video) or {"--start", "--end", "--stir"} & {*changed_options(self.config)}:
+            self.job(say)  # says what contradicts
         require_writable_folder("OUT", self.out)
         from ..pipeline import Entry
         from ..pipeline.choice import SCAN, choose_segment
         from ..system.atomic import write_json
-        from .batch import do_all
 
         choice = choose_segment(self.video, self.out, self.config.folder_rate)
         self.out.mkdir(parents=True, exist_ok=True)

@@ -47,15 +47,15 @@ def disturbances(
             clear, usual, low = (
                 float(np.percentile(each[near], share)) for each, share in ((contrast, 90), (focus, 50), (floor, 10))
             )
-            if clear >= LEAST_CONTRAST and contrast[i] < HAZE_RATIO * clear and floor[i] > low + HAZE_RISE:
-                words[i], weights[i] = "smoke", max(contrast[i] / clear, FLOOR_WEIGHT)
-            elif focus[i] < max(UNFOCUSED, BLUR_RATIO * usual):
+            if focus[i] < max(UNFOCUSED, BLUR_RATIO * usual):
                 words[i], weights[i] = "blur", max(focus[i] / max(usual, 2 * UNFOCUSED), FLOOR_WEIGHT)
+            elif clear >= LEAST_CONTRAST and contrast[i] < HAZE_RATIO * clear and floor[i] > low + HAZE_RISE:
+                words[i], weights[i] = "smoke", max(contrast[i] / clear, FLOOR_WEIGHT)
     return words, weights
 
 
 def scenes_outside(measured: Sequence[FrameQuality], scene: NDArray[np.integer]) -> set[int]:
-    """The scenes that show no inside of a body, as far as that is sure.
+    """The numbers of `scene` (T,) that show no inside of a body, as far as that is sure.
 
     Color alone does not tell: tissue can be gray or blue. It must also differ from the rest of the clip, and vary.
     """

@@ -5,11 +5,13 @@ Smoke, a tool that moves, blur and a flash change the image, too, but the tissue
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from .components import Image
 
@@ -52,6 +54,12 @@ def jumps(seconds: NDArray[np.float64], changes: NDArray[np.float64]) -> NDArray
         others = np.delete(changes[first:end], i - first)
         found[i] = changes[i] > JUMP_RATIO * (np.median(others) if len(others) else 0)
     return found
+
+
+def connected(count: int, links: Sequence[tuple[int, int]]) -> NDArray[np.int32]:
+    """(T,) a number for each set of images that are linked, one by one, by showing the same tissue."""
+    first, second = np.array(links, np.int64).reshape(-1, 2).T
+    return connected_components(coo_array((np.ones(len(first)), (first, second)), (count, count)), directed=False)[1]
 
 
 def breaks(count: int, links: Iterable[tuple[int, int]]) -> NDArray[np.bool_]:

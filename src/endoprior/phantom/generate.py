@@ -107,7 +107,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             if cfg.stereo:
                 other = render_view(scene, now, Eye.moved(cfg.baseline_mm))
                 right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
-            depth = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
+            measured = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
             turned = slice(None, None, -1) if is_mirrored(events, index) else slice(None)
             tissue = np.round(develop(view.tissue, gain, lens)).astype(np.uint8)
             writer.write_image("truth/tissue", tissue[:, turned])
@@ -124,10 +124,10 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
                     writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
             else:
                 ever_seen |= seen
-            image, mask, depth = (np.ascontiguousarray(each[:, turned]) for each in (image, mask, depth))
+            image, mask, measured = (np.ascontiguousarray(each[:, turned]) for each in (image, mask, measured))
             if not shows_body(events, index):
-                mask, depth = np.zeros_like(mask), np.zeros_like(depth)
-            writer.add(disturbed(image, events, index, cfg.seed), mask, depth, right)
+                mask, measured = np.zeros_like(mask), np.zeros_like(measured)
+            writer.add(disturbed(image, events, index, cfg.seed), mask, measured, right)
             if progress is not None:
                 progress(index + 1, cfg.frames)
         for index, packed in behind_tools.items():  # what is seen later is known only now

@@ -15,7 +15,7 @@ from ..footage.components import runs
 from ..footage.disturbances import disturbances, scenes_outside
 from ..footage.frame_quality import FrameQuality, measure_quality, small_size, view_mask
 from ..footage.same_view import Link, View, feature_link, flow_link
-from ..footage.scenes import THUMB_WIDTH, breaks, change, jumps, standardized
+from ..footage.scenes import THUMB_WIDTH, breaks, change, connected, jumps, standardized
 from .source import Source, open_source, quick_images
 
 LOOKS, RATES = 3000, (2.0, 10.0)
@@ -90,17 +90,28 @@ def scan_video(
     is_cut = breaks(len(looks), watch.pairs) & sudden[: len(looks)]
     cuts = [float(first_after[i]) for i in np.flatnonzero(is_cut)]
     duration = max(source.seconds, times[-1] if times else 0.0)
-    return Scan(duration, rate, _judged(looks, is_cut, np.array(frozen) < FROZEN, rate), cuts)
+    return Scan(
+        duration,
+        rate,
+        _judged(looks, is_cut, connected(len(looks), watch.pairs), np.array(frozen) < FROZEN, rate),
+        cuts,
+    )
 
 
-def _judged(looks: list[Look], is_cut: NDArray[np.bool_], same: NDArray[np.bool_], rate: float) -> list[Look]:
-    """The looks with what is wrong with each. Args: same: whether a look repeats the one before."""
+def _judged(
+    looks: list[Look], is_cut: NDArray[np.bool_], place: NDArray[np.integer], same: NDArray[np.bool_], rate: float
+) -> list[Look]:
+    """The looks with what is wrong with each.
+
+    Args:
+        place: a number for each set of looks at the same tissue. same: whether a look repeats the one before.
+    """
     seconds, measured = np.array([look.seconds for look in looks]), [look.quality for look in looks]
     scene = np.cumsum(is_cut, dtype=np.int64)
     words, weights = disturbances(seconds, measured, scene)
-    outside = scenes_outside(measured, scene)
+    outside = scenes_outside(measured, place)
     for i in range(len(looks)):
-        if scene[i] in outside:
+        if place[i] in outside:
             words[i], weights[i] = OUTSIDE, 0.0
     for first, end in runs(np.array(words) == ""):  # a clear image between two of the same smoke is in it
         lasts = seconds[min(end, len(looks) - 1)] - seconds[first]
