@@ -1,12 +1,13 @@
 """`endoprior scan`: every disturbance of a phantom is found at its frames, and nothing else is."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from endoprior.cli import main
-from endoprior.data.images import read_color
+from endoprior.data.images import read_color, save_png
 from endoprior.footage.changes import find_changes
 from endoprior.footage.scenes import breaks, jumps
 from endoprior.phantom import PhantomConfig, write_phantom
@@ -89,6 +90,18 @@ def test_the_weights_of_a_sequence_fall_where_it_is_blurred(disturbed):
     low = np.flatnonzero(changes.weights < 1)
     assert {*range(12, 18), *range(30, 38)} <= {*low.tolist()} <= {*range(12, 18), *range(30, 38), *range(60, 75)}
     assert set(changes.off_color) >= set(range(60, 75))
+
+
+def test_a_still_image_and_a_dark_one_are_no_video(disturbed, tmp_path):
+    images = sorted((disturbed / "images").iterdir())
+    dark = np.full((128, 160, 3), 5, np.uint8)
+    order = [*images[38:50], *[images[50]] * 13, *images[51:60]]
+    for i, file in enumerate(order):
+        shutil.copy(file, tmp_path / f"{i:04d}.png")
+    for i in range(len(order), len(order) + 6):
+        save_png(tmp_path / f"{i:04d}.png", dark)
+    words = [look.word for look in scan_video(tmp_path, RATE).looks]
+    assert words == [""] * 13 + ["repeated frames"] * 12 + [""] * 9 + ["dark"] * 6
 
 
 def test_a_cut_needs_a_jump_that_no_pair_of_images_bridges():

@@ -63,7 +63,10 @@ class Choice:
             other, folder = self.segments[i], out.with_name(f"{out.name}_segment_{i + 1}")
             again = command("run", video, folder, "--segment", str(i + 1))
             lines.append(f"  {other.best[0]:.1f}-{other.best[1]:.1f} s, score {other.score:.1f}: `{again}`")
-        return [*lines, f"all of them: --all-segments; the timeline: {out / SCAN} and .png"]
+        return [
+            *lines,
+            f"every segment: --all-segments with another OUT; the timeline: {(out / SCAN).with_suffix('.png')}",
+        ]
 
 
 def choose_segment(video: Path, out: Path, folder_rate: float, wanted: int = 0) -> Choice:
@@ -74,10 +77,10 @@ def choose_segment(video: Path, out: Path, folder_rate: float, wanted: int = 0) 
     """
     facts = json.dumps(source_facts(video) | {"folder_rate": folder_rate})
     identity = hashlib.sha256(facts.encode()).hexdigest()  # its name may be that of a patient
-    stored = read_json(out / SCAN) if (out / SCAN).is_file() else {}
-    scanned = (
-        stored if stored.get("video") == identity else as_json(scan_video(video, folder_rate)) | {"video": identity}
-    )
+    stored = [read_json(folder / SCAN) for folder in (out, out.parent) if (folder / SCAN).is_file()]
+    scanned = next((each for each in stored if each.get("video") == identity), None)
+    if scanned is None:
+        scanned = as_json(scan_video(video, folder_rate)) | {"video": identity}
     choice = Choice(scanned, 0)
     count, is_whole = len(choice.segments), len(choice.stretches) == 1
     if wanted > max(count, 1):

@@ -18,7 +18,7 @@ from ..footage.same_view import Link, View, feature_link, flow_link
 from ..footage.scenes import THUMB_WIDTH, breaks, change, connected, jumps, standardized
 from .source import Source, open_source, quick_images
 
-LOOKS, RATES = 3000, (2.0, 10.0)
+LOOKS, RATES = 2400, (2.0, 10.0)
 """So many images are looked at, if that is not less or more than these rates, 1/s."""
 GLIMPSES = 24  # images that show which part of the frame is the endoscope's image
 BACK_S = 3.0  # tissue is looked for in the images of so long before, s
