@@ -67,6 +67,16 @@ def test_the_longest_clear_segment_is_chosen_and_a_scan_is_kept(disturbed, tmp_p
     assert [round(time * RATE) for time in again.span] == [18, 30]
 
 
+@pytest.mark.parametrize("number", ["-1", "6"])
+def test_a_segment_that_is_not_there_is_named(disturbed, tmp_path, capsys, number):
+    words = ["run", str(disturbed / "images"), str(tmp_path / "out"), "--folder-rate", "10", "--segment", number]
+    assert main(words) == 2
+    assert f"--segment: expected the number of a segment, got {number}, with 5 in" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main([*words, "--start", "1"]) == 2
+    assert "--segment: expected no --start" in capsys.readouterr().err
+
+
 def test_a_clear_phantom_is_one_segment_and_used_as_a_whole(tmp_path):
     write_phantom(tmp_path / "data", PhantomConfig(**SMALL | {"frames": 40}))
     choice = choose_segment(tmp_path / "data" / "images", tmp_path, RATE)

@@ -124,7 +124,8 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
                     writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
             else:
                 ever_seen |= seen
-            image, mask, measured = (np.ascontiguousarray(each[:, turned]) for each in (image, mask, measured))
+            image, mask = np.ascontiguousarray(image[:, turned]), np.ascontiguousarray(mask[:, turned])
+            measured = np.ascontiguousarray(measured[:, turned])
             if not shows_body(events, index):
                 mask, measured = np.zeros_like(mask), np.zeros_like(measured)
             writer.add(disturbed(image, events, index, cfg.seed), mask, measured, right)

@@ -83,7 +83,7 @@ def choose_segment(video: Path, out: Path, folder_rate: float, wanted: int = 0) 
         scanned = as_json(scan_video(video, folder_rate)) | {"video": identity}
     choice = Choice(scanned, 0)
     count, is_whole = len(choice.segments), len(choice.stretches) == 1
-    if wanted > max(count, 1):
+    if not 0 <= wanted <= max(count, 1):
         got = f"{wanted}, with {count} in {video}"
         raise input_error("--segment", "the number of a segment", got, f"`{command('scan', video)}` lists them.")
     if not count or is_whole:
