@@ -102,8 +102,7 @@ class PhantomConfig:
         for name, known in (("instruments", get_args(Instruments)), ("tissue", get_args(Tissue))):
             if getattr(self, name) not in known:
                 raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
-        if parse_events(self.events, self.frames) and self.stereo:
-            raise input_error("--events", "no --stereo", "--events and --stereo", "Remove one of them.")
+        parse_events(self.events, self.frames)
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
         if self.width * self.height * share > MOST_PIXELS:

@@ -42,7 +42,7 @@ def parse_events(text: str, frames: int) -> tuple[Event, ...]:
 
 
 def is_mirrored(events: tuple[Event, ...], index: int) -> bool:
-    """Whether a frame lies behind a cut: all of it is mirrored, which no motion of a camera does."""
+    """Whether a frame lies behind a cut: it is upside down and mirrored in one, which no motion of a camera does."""
     return sum(event.kind == "cut" and event.first <= index for event in events) % 2 == 1
 
 

@@ -110,8 +110,8 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             measured = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
             turned = slice(None, None, -1) if is_mirrored(events, index) else slice(None)
             tissue = np.round(develop(view.tissue, gain, lens)).astype(np.uint8)
-            writer.write_image("truth/tissue", tissue[:, turned])
-            writer.write_array(f"truth/depth/{index:06d}.npy", z[:, turned])
+            writer.write_image("truth/tissue", tissue[turned])
+            writer.write_array(f"truth/depth/{index:06d}.npy", z[turned])
             seen = visible_points(now.vertices, z, mask, cfg)
             points.append(now.vertices[tracked[:, 0], tracked[:, 1]])
             is_clear = shows_body(events, index) and not is_mirrored(events, index)
@@ -124,8 +124,10 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
                     writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
             else:
                 ever_seen |= seen
-            image, mask = np.ascontiguousarray(image[:, turned]), np.ascontiguousarray(mask[:, turned])
-            measured = np.ascontiguousarray(measured[:, turned])
+            image, mask = np.ascontiguousarray(image[turned]), np.ascontiguousarray(mask[turned])
+            measured = np.ascontiguousarray(measured[turned])
+            if right is not None:
+                right = disturbed(np.ascontiguousarray(right[turned]), events, index, cfg.seed)
             if not shows_body(events, index):
                 mask, measured = np.zeros_like(mask), np.zeros_like(measured)
             writer.add(disturbed(image, events, index, cfg.seed), mask, measured, right)
