@@ -1,5 +1,6 @@
 """docs/add_a_method.md: its method is complete. It trains, resumes, is scored, drawn, carried and exported."""
 
+import json
 import re
 import signal
 import tomllib
@@ -7,10 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import yaml
 from plugin_packages import on_path, write_package
 
+from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.config import OWN, Config
 from endoprior.core.config_io import to_dict
@@ -19,9 +23,13 @@ from endoprior.evaluation.scoring import evaluate
 from endoprior.model.method import METHODS, config_from, method_named, method_of
 from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import load_scene
+from endoprior.model.single_scene import FORMAT
 from endoprior.runs.train import train
+from endoprior.system.arrays_file import save_arrays
+from endoprior_studies.spec_file import load_spec
 
 PAGE = Path(__file__).parents[1] / "docs" / "add_a_method.md"
+BENCH = PAGE.parents[1] / "examples" / "own_bench.yaml"
 
 
 @contextmanager
@@ -29,7 +37,10 @@ def registered(site: Path, change: tuple[str, str] = ("", "")) -> Iterator[None]
     """The page's methods, registered as the page says; with a text in the code of the loss replaced."""
     (entries,) = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     examples = PAGE.parents[1] / "examples"
-    code = {name: (examples / f"{name}.py").read_text(encoding="utf-8") for name in ("linear_method", "own_loss")}
+    code = {
+        name: (examples / f"{name}.py").read_text(encoding="utf-8")
+        for name in ("linear_method", "own_loss", "own_score")
+    }
     assert all(len(text.splitlines()) < 100 for text in code.values()) and change[0] in code["own_loss"]
     code["own_loss"] = code["own_loss"].replace(*change) if change[0] else code["own_loss"]
     groups = tomllib.loads(entries)["project"]["entry-points"]
@@ -103,6 +114,50 @@ def test_a_wrong_loss_is_one_line_with_a_fix_that_its_author_can_follow(tiny_seq
     with registered(tmp_path / "site", change), pytest.raises(InputError, match=message) as caught:
         train(load_sequence(tiny_sequence), preset("own-loss", iterations=4, gaussians=200))
     assert "\n" not in str(caught.value)
+
+
+def test_a_scene_whose_plugin_is_missing_names_what_to_install(tmp_path):
+    about = {"config": {"method": "elsewhere"}}
+    save_arrays(tmp_path / "scene.safetensors", {"x": torch.zeros(1)}, about, FORMAT)
+    with pytest.raises(InputError) as caught:
+        load_scene(tmp_path)
+    said = str(caught.value)
+    assert said.startswith(f"{tmp_path / 'scene.safetensors'}: method: expected one of ") and "got 'elsewhere'" in said
+    assert said.count("Fix: ") == 1 and "Fix: Install the package with this plugin; " in said
+def test_the_worked_example_loads_and_its_score_is_that_of_means(tmp_path, tiny_sequence):
+    with registered(tmp_path / "site"):
+        spec = load_spec(BENCH)
+        assert set(spec.methods) == {"default", "own-loss", "deform3dgs", "endogaussian"} and len(spec.seeds) == 3
+        sequence = load_sequence(tiny_sequence)
+        scene = train(sequence, preset("own-loss", iterations=4, gaussians=200))
+        score = evaluate(scene, sequence, networks=False).scores["area_error"]
+        frames = [sequence.frame(i) for i in range(len(sequence)) if (i - 1) % 8 == 0]
+        found = [_area_error(scene.render(frame.time).color.numpy(), frame) for frame in frames]
+        assert score == pytest.approx(np.mean(found), abs=0.2)  # scores are of 8 bits
+
+
+def _area_error(image: np.ndarray, frame) -> float:
+    """The score as a loop over squares, in percent."""
+    errors = []
+    for y in range(0, frame.rgb.shape[0] - 7, 8):
+        for x in range(0, frame.rgb.shape[1] - 7, 8):
+            square = slice(y, y + 8), slice(x, x + 8)
+            if frame.tissue_mask[square].all():
+                errors.append(np.abs(image[square].mean((0, 1)) - frame.rgb[square].mean((0, 1))))
+    return 100 * float(np.mean(errors))
+
+
+@pytest.mark.slow
+def test_the_worked_example_runs_to_its_figure(tmp_path):
+    small = yaml.safe_load(BENCH.read_text(encoding="utf-8"))
+    small |= {"seeds": [0], "set": {"iterations": 12}, "claims": []}
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(small))
+    with registered(tmp_path / "site"):
+        assert main(["bench", str(tmp_path / "small.yaml"), str(tmp_path / "out"), "--cores", "1"]) == 0
+    cells = json.loads((tmp_path / "out" / "results.json").read_text())["cells"]
+    assert {cell["method"] for cell in cells} == {"default", "own-loss", "deform3dgs", "endogaussian"}
+    assert all(cell["scores"]["area_error"] > 0 for cell in cells)
+    assert (tmp_path / "out" / "figures" / "frames-phantom.png").exists()
 
 
 def test_every_method_can_be_found_and_names_itself():

@@ -13,6 +13,7 @@ import pytest
 from tiny_training import tiny_config
 
 from endoprior.cli import main
+from endoprior.cli.paths import require_writable_folder
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.runs.log import read_log
@@ -125,6 +126,20 @@ def test_a_repeated_signal_does_not_end_the_cleanup():
         signal.raise_signal(signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_signal_leaves_no_probe_of_a_folder(tmp_path, monkeypatch, name):
+    touch = Path.touch
+
+    def stop(path, *words, **options):
+        touch(path, *words, **options)
+        signal.raise_signal(getattr(signal, name))
+
+    monkeypatch.setattr(Path, "touch", stop)
+    with all_interrupt(), pytest.raises(KeyboardInterrupt):
+        require_writable_folder("OUT", tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_names_with_colons_are_written(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import yaml
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
-from endoprior.data.scared import dataset_number
+from endoprior.data.scared import STRIDES, dataset_number
 from endoprior.model.presets import preset
 from endoprior_studies.spec import Cell, MethodSpec, cells, sequence_folder
 from endoprior_studies.spec_file import find_spec, load_spec, load_specs, spec_names, specs_of
@@ -218,15 +218,21 @@ def test_the_ladder_leads_from_endogaussian_to_released(size):
 
 def test_scared_has_the_settings_published_for_it():
     """EndoGaussian's and the released code's; the paper says nothing but EndoGaussian's schedule."""
-    spec, methods = load_spec(find_spec("full/scared")), load_spec(find_spec("full/methods"))
+    spec, methods = load_spec(find_spec("reproduce/table1_scared")), load_spec(find_spec("reproduce/table1"))
     assert {*methods.sequences} == {"pulling", "cutting"} and spec.methods == methods.methods
-    numbers = [dataset_number(spec.resolved(sequence.path)) for sequence in spec.sequences.values()]
-    assert numbers == [1, 2, 3, 6, 7], "the stride follows from the folder's name"
+    strides = {dataset_number(spec.resolved(about.path)): about.stride for about in spec.sequences.values()}
+    assert strides == STRIDES, "whatever the user's folder is called"
     published = {"deformation.hexplane.channels": 32, "deformation.deform_shape": False}
     shorter = published | {"schedule.fine_iterations": 2000, "optim.decay_iterations": 2000}
     # The release trains as long as on EndoNeRF, does not clean up, and its pixels and principal point agree.
     released = published | {"released.cleanup": False, "released.half_pixel_shift": False}
-    for method, changes in (("endogaussian", shorter), ("paper", shorter), ("released", released), ("default", {})):
+    many = {"init.budget": 30_000}
+    for method, changes in (
+        ("endogaussian", shorter | many),
+        ("paper", shorter),
+        ("released", released),
+        ("default", {}),
+    ):
         found = spec.config(method, "d1", None, 0)
         assert found == replace(preset(method).replace(changes), data=found.data)
         assert found.data.lift_missing_depth == preset(method).data.lift_missing_depth
@@ -247,7 +253,9 @@ def test_depth_flags_change_the_flags_and_nothing_else(size):
 
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
     names = spec_names()
-    assert {"quick", "found_masks", "poses", "sized", "sized/whole_clip", "full", "full/methods"} <= {*names}
+    assert {"quick", "found_masks", "poses", "sized", "sized/whole_clip", "full", "reproduce", "reproduce/table1"} <= {
+        *names
+    }
     assert not [name for name in names if "_small" in name], "it is only there to be extended"
     monkeypatch.chdir(tmp_path)
     written(tmp_path).rename("quick")

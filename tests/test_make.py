@@ -126,3 +126,15 @@ def test_docs_do_not_change_how_the_program_is_installed(checkout, installed):
     whole = ["python -m pip install torch", "python -m pip install --editable .[docs]"]
     wanted = ["python -m pip install furo>=2 sphinx>=8"] if installed else whole
     assert [line for line in calls(checkout) if "pip install" in line] == wanted
+
+
+@pytest.mark.parametrize("how", ["False", "True", "absent"])
+def test_a_plain_installation_stays_one(checkout, how):
+    answer = 'case "$*" in *direct_url*) ' + ("exit 1" if how == "absent" else f"echo {how}") + ";; esac"
+    program(checkout, "python3", RECORDS.format(name="python", then="true") + answer)
+    (checkout / ".venv" / "bin").mkdir(parents=True)
+    shutil.copy(checkout / "programs" / "python3", checkout / ".venv" / "bin" / "python")
+    (checkout / ".venv" / "bin" / "pip").touch()
+    done = make(checkout, target=".venv/.installed")
+    assert done.returncode == 0, done.stderr
+    assert calls(checkout)[-1] == f"python -m pip install {'' if how == 'False' else '--editable '}."

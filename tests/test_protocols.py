@@ -24,7 +24,7 @@ from endoprior.evaluation.scorers.image import ssim, ssim_valid
 from endoprior.evaluation.scorers.lpips import LpipsDistance
 from endoprior.evaluation.scoring import evaluate
 
-TAGS = Path(__file__).parents[1] / "docs" / "results" / "published_tags.csv"
+TAGS = Path(__file__).parents[1] / "src" / "endoprior_studies" / "published_tags.csv"
 TEST = [1, 9]
 NAMES = PROTOCOLS.names()
 ZEROS = np.zeros((40, 48), bool)

@@ -42,4 +42,12 @@ if [ -n "${TORCH_INDEX:-}" ]; then
 else
     install torch
 fi
-install --editable ".${1:+[$1]}"
+# A plain installation (`pip install .`) stays one, unless tests need the checkout.
+origin='json.loads(m.distribution("endoprior").read_text("direct_url.json") or "{}")'
+editable="import importlib.metadata as m, json; print($origin.get('dir_info', {}).get('editable', False))"
+how=$(.venv/bin/python -c "$editable" 2>/dev/null) || how=
+if [ "$how" = False ] && [ -z "${1:-}" ]; then
+    install .
+else
+    install --editable ".${1:+[$1]}"
+fi

@@ -1,4 +1,4 @@
-"""Deform3DGS: Gaussians that move by learned basis functions over time. Yang et al., MICCAI 2024, as released.
+"""Deform3DGS: Gaussians move by learned functions of time. Yang et al., MICCAI 2024, as released.
 
 It starts from the surface of the first frame and what other frames show that it does not, but from training frames
 only (`Deform3DGS@b06f0a5`). Its loss and its density control are the defaults, with the weights of `config`. What

@@ -1,4 +1,4 @@
-"""Endo-4DGS: a small HexPlane field, and terms that trust depth only as far as it can be. Huang et al., MICCAI 2024.
+"""Endo-4DGS: a small HexPlane field, and confidence in depth. Huang et al., MICCAI 2024.
 
 As released. What differs from the release, and why, is in docs/methods.md.
 """

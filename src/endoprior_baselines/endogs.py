@@ -1,4 +1,4 @@
-"""EndoGS: a HexPlane field that moves everything, rays weighted by how often tools hide them. As released, 2024.
+"""EndoGS: a HexPlane moves everything, rays weighted by tools. As released, 2024.
 
 Field: HexPlane features, trunk (linear F -> W, ReLU, linear W -> W) and one head (ReLU, linear W -> W, ReLU, linear
 W -> 59) for center 3, scale 3, rotation 4, opacity 1, color 48. What differs from the release, and why, is in

@@ -1,4 +1,4 @@
-"""SurgicalGaussian: a network moves the Gaussians, neighbors keep their distance. Xie et al., MICCAI 2024, as released.
+"""SurgicalGaussian: a network moves the Gaussians. Xie et al., MICCAI 2024, as released.
 
 Its unit of length is 100 mm, so thresholds and rates that are lengths are 100 times those of the release here. What
 differs from the release, and why, is in docs/methods.md.

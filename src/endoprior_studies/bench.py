@@ -6,6 +6,7 @@ import os
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from endoprior.cli.arguments import Command, parse
 from endoprior.core.checks import input_error
@@ -13,8 +14,12 @@ from endoprior.system.console import say
 
 from .tool_training import bench as bench_masks
 
+if TYPE_CHECKING:
+    from .spec import Spec
+
 MOST_CORES = 4096
 """Largest --cores and --threads."""
+MOST_ITERATIONS = 10_000_000
 
 
 @dataclass
@@ -24,10 +29,11 @@ class Bench(Command):
     spec: str = field(metadata={"place": "SPEC"})
     """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: the network that finds tools, on
     frames that it has not seen (`endoprior bench masks --help`). found_masks: given and found tool masks. poses: given
-    and estimated camera path. sized: the paper's tables, for two cores. full: the same at full size.
-    radiance: the two radiance fields, a day. One table: sized/NAME or full/NAME with budgets, compared, depth_flags,
-    growth, instability, ladder, matched, methods, primitives, regime, temporal; sized/whole_phantom; sized/whole_clip;
-    full/radiance; full/scared."""
+    and estimated camera path. reproduce: the paper's tables on EndoNeRF data and SCARED, published figures beside
+    yours; one table: reproduce/NAME with table1, table1_scared, table2, table3, table4, table5. sized: tables for two
+    cores; one: sized/NAME with budgets, compared, depth_flags, growth, instability, ladder, matched, methods,
+    primitives, regime, temporal, whole_clip, whole_phantom. full: most of them at full size. radiance: the two radiance
+    fields."""
     out: Path = field(metadata={"place": "OUT"})
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
@@ -38,12 +44,24 @@ class Bench(Command):
     """Address of a Ray cluster that shares this file system; `local` starts one."""
     data: tuple[str, ...] = ()
     """NAME=FOLDER: the folder of a sequence of the spec, in place of the spec's own."""
+    methods: tuple[str, ...] = ()
+    """Only these methods of the spec."""
+    seeds: tuple[int, ...] = ()
+    """Seeds, in place of those of the spec."""
+    iterations: int = 0
+    """Length of every training, in place of the method's own: a trial of the whole way, not a result."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     report_only: bool = False
     """Train nothing; write the report of the finished cells."""
+    estimate: bool = False
+    """Only measure how long it will take. reproduce does so before it begins."""
 
-    examples = ("quick OUT", "sized OUT --report-only")
+    examples = (
+        "quick OUT",
+        "sized OUT --report-only",
+        "reproduce OUT --data pulling=FOLDER cutting=FOLDER d1=FOLDER --estimate",
+    )
 
 
 def run(argv: list[str]) -> int:
@@ -55,43 +73,66 @@ def run(argv: list[str]) -> int:
     from endoprior.system.file_lock import locked
 
     from .execute import local_executor, ray_executor
-    from .matrix import run_matrix
+    from .matrix import Matrix, run_matrix
     from .report import write_overview, write_report
-    from .spec_file import find_spec, load_specs, specs_of
+    from .spec_file import find_spec
+    from .timing import estimate
 
-    for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
-        if not least <= value <= MOST_CORES:
-            raise input_error(option, f"{least} to {MOST_CORES}", f"{value}", "choose a value in this range.")
-    if args.weights_dir and not args.weights_dir.is_dir():
-        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
-    folders, source = _folders(args.data), find_spec(args.spec)
-    loaded = load_specs(specs_of(source), folders)
+    source = find_spec(args.spec)
+    loaded = _chosen(args, source)
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise input_error(args.out, "a place for a folder", f"{error.strerror}", "Choose another folder.") from None
-    failed, reports = 0, {}
+    at_once, reports = 1 if args.ray else max(1, (args.cores or _cores()) // args.threads), {}
     with locked(args.out, args.out / ".lock"):
         if args.report_only:
             executor = nullcontext(None)
         elif args.ray:
             executor = ray_executor(args.ray, args.threads)
         else:
-            executor = local_executor(max(1, (args.cores or _cores()) // args.threads))
+            executor = local_executor(at_once)
         with executor as execute:
-            for path, spec in loaded.items():
+
+            def matrix_of(spec: Spec) -> Matrix:
+                about = {"threads": args.threads, "weights_dir": args.weights_dir}
+                return run_matrix(spec, args.out, execute, **about, progress=say)
+
+            if execute and (args.estimate or any(spec.published for spec in loaded.values())):
+                say("estimate: each method with a long schedule is first trained for a short time")
+                named = {path.stem: spec for path, spec in loaded.items()}
+                say("\n".join(estimate(named, args.out, matrix_of).lines(at_once)))
+            for path, spec in () if args.estimate else loaded.items():
                 folder = args.out / path.stem if source.is_dir() else args.out
                 say(f"{path}: {spec.title}")
-                matrix = run_matrix(
-                    spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, progress=say
-                )
+                matrix = reports[folder] = matrix_of(spec)
                 report = write_report(matrix, folder)
-                failed, reports[folder] = failed + matrix.failed, matrix
                 say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\nreport: {report}")
-    if source.is_dir():
+    if source.is_dir() and reports:
         say(f"overview: {write_overview(reports, args.out)}")
-    return 1 if failed else 0
+    return 1 if any(matrix.failed for matrix in reports.values()) else 0
+
+
+def _chosen(args: Bench, source: Path) -> dict[Path, Spec]:
+    """The specs to run. Folders that were typed must be there; of published tables those run that they belong to."""
+    from .matrix import open_sequence
+    from .spec import Choice
+    from .spec_file import load_specs, specs_of
+
+    limits = (("--threads", args.threads, 1, MOST_CORES), ("--cores", args.cores, 0, MOST_CORES))
+    for option, value, least, most in (*limits, ("--iterations", args.iterations, 0, MOST_ITERATIONS)):
+        if not least <= value <= most:
+            raise input_error(option, f"{least} to {most}", f"{value}", "choose a value in this range.")
+    if args.weights_dir and not args.weights_dir.is_dir():
+        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
+    folders = _folders(args.data)
+    loaded = load_specs(specs_of(source), folders, Choice(args.methods, args.seeds, args.iterations))
+    typed = {path: folders.keys() & spec.sequences.keys() for path, spec in loaded.items()}
+    for path, names in typed.items():
+        for name in sorted(names):
+            open_sequence(loaded[path], name, args.out, write=False)
+    return {path: spec for path, spec in loaded.items() if typed[path] or not (folders and spec.published)}
 
 
 def _cores() -> int:

@@ -53,6 +53,10 @@ class Matrix:
     """Number of cells among them that ran and failed."""
     data: dict[str, Path] = field(default_factory=dict)
     """Folder of each readable sequence that its cells are scored on."""
+    extents: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    """Frames, width and height of each of these, as it is read."""
+    waiting: dict[Cell, str] = field(default_factory=dict)
+    """Folder of each cell that was only looked for; equal cells have the same one."""
     relative: set[str] = field(default_factory=set)
     """Names of those whose depth has no known scale, so that lengths are not in mm."""
     searches: dict[Place, Search] = field(default_factory=dict)
@@ -126,7 +130,7 @@ class _Runner:
         write, spec = execute is not None, matrix.spec
         for name in spec.sequences:
             try:
-                sequence = _sequence(spec, name, matrix.out, write)
+                sequence = open_sequence(spec, name, matrix.out, write)
                 self.trained_on[name], self.known[name] = sequence.path, [sequence.fingerprint()]
                 if found := spec.sequences[name].found_parts:
                     from .changed_copy import changed_copy  # late: it imports what finds tools and follows the camera
@@ -138,6 +142,7 @@ class _Runner:
                     self.known[name] += [copy.fingerprint()]
                     self.known[name] += [read_json(copy.path / SCORES_FILE)["scores"]] if "masks" in found else []
                 matrix.data[name] = sequence.path
+                matrix.extents[name] = len(sequence), sequence.camera(0).width, sequence.camera(0).height
                 matrix.relative |= {name} if sequence.depth_is_relative else set()
             except InputError as error:
                 self.unreadable[name] = str(error)
@@ -166,7 +171,7 @@ class _Runner:
             elif isinstance(job, str):
                 matrix.missing[cell] = job
             elif self.execute is None:
-                matrix.missing[cell] = "not run yet"
+                matrix.missing[cell], matrix.waiting[cell] = "not run yet", job.folder
             else:  # different methods can have equal configs
                 jobs[job.folder] = job
                 by_folder.setdefault(job.folder, []).append(cell)
@@ -246,11 +251,11 @@ def _made_from(spec: Spec, cell: Cell, options: dict[str, Any]) -> list[Any]:
     return []
 
 
-def _sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequence:
+def open_sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequence:
     """A sequence; a missing phantom is written.
 
     Raises:
-        InputError: it is missing or cannot be read.
+        InputError: it is missing, cannot be read, or has not the number of frames of the published one.
     """
     from endoprior.core.config import DataConfig
     from endoprior.data import load_sequence
@@ -261,7 +266,12 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequence:
         raise input_error(chosen.path, f"the variable {unset[1]}", "none", f"set it, or use --data {name}=FOLDER.")
     if chosen.phantom and write and not folder.is_dir():
         write_phantom(folder, chosen.phantom)
-    return load_sequence(folder, DataConfig(**chosen.reading))
+    sequence = load_sequence(folder, DataConfig(**chosen.reading))
+    published = spec.published.frames.get(name) if spec.published else None
+    if published not in (None, len(sequence)):
+        want, fix = f"the {published} frames of the published sequence {name}", f"Correct --data {name}=FOLDER."
+        raise input_error(folder, want, f"{len(sequence)}", fix)
+    return sequence
 
 
 def commits_of(matrix: Matrix) -> list[str]:

@@ -16,6 +16,7 @@ from endoprior.system.atomic import write_json, write_text
 
 from .figures import GRIDS, budget_figure, curve_figure, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
+from .published import published_blocks, published_table
 from .results import Results
 from .spec import ClaimSpec
 from .statistics import Difference
@@ -44,6 +45,8 @@ def write_report(matrix: Matrix, out: Path) -> Path:
     _figures(matrix, results, out / "figures")
     tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
     tables += protocol_tables(matrix)
+    if about := matrix.spec.published:
+        tables.insert(0, published_table(results, about, [*matrix.data]))
     write_text(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
     write_text(out / "results.csv", csv_lines(results, protocol_values(matrix)))
     write_json(out / "results.json", _facts(matrix, results))
@@ -69,6 +72,7 @@ def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int
     below = "#" * (level + 1)
     return [
         *_head(matrix, "#" * level),
+        *published_blocks(matrix, results, below),
         *_tables(matrix, results, below),
         *claims_section(results, below),
         *_searches(matrix, below),

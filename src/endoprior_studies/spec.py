@@ -69,6 +69,22 @@ class MatchSpec:
 
 
 @dataclass(frozen=True)
+class PublishedSpec:
+    """The published table that a spec repeats; `published` writes both side by side."""
+
+    table: str
+    """Start of `source` in published.csv."""
+    data: str
+    """Its `data` there. The figures are means over the sequences of the spec."""
+    size: tuple[int, int]
+    """Width and height of the published frames, px; others are said in the report."""
+    frames: dict[str, int] = field(default_factory=dict)
+    """Number of frames of a sequence; with another one it is not the published sequence."""
+    differs: tuple[str, ...] = ()
+    """What is done in another way here, one sentence each."""
+
+
+@dataclass(frozen=True)
 class MethodSpec:
     """One method: a preset, a method of another package, or the images of another program; and its changes."""
 
@@ -88,6 +104,10 @@ class MethodSpec:
     """Name in tables; the method's own if empty."""
     match: MatchSpec | None = None
     """Search for `density.grow_threshold`, on each sequence with the first seed; the others use what is found."""
+    published: str = ""
+    """Its name in published.csv."""
+    only_if_named: bool = False
+    """Leave it out unless `--methods` names it."""
 
     @property
     def name(self) -> str:
@@ -148,6 +168,9 @@ class Spec:
     """Also compute the scores that need a network (RAFT, LPIPS), if their weights are found."""
     protocols: tuple[str, ...] = ()
     """Also score as these papers did; each protocol has tables of its own (docs/scores.md)."""
+    published: PublishedSpec | None = None
+    iterations: int = 0
+    """Length of every training with our config, in place of the method's own; 0 keeps that."""
     folder: str = "."
     """Base of relative paths: the folder of the spec file."""
 
@@ -196,6 +219,7 @@ class Spec:
         ):
             override(values, overrides, where)
         if has_config:
+            override(values, {"iterations": self.iterations} if self.iterations else {}, "iterations")
             values["data"] |= self.sequences[sequence].reading | {"test_phase": fold}
             if budget is not None:
                 values["init"]["budget"] = budget
@@ -217,6 +241,30 @@ class Spec:
         """A path of the spec: `~` and `$NAME` expanded, relative to the spec's folder."""
         expanded = Path(os.path.expandvars(path)).expanduser()
         return expanded if expanded.is_absolute() else Path(self.folder) / expanded
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which part of a spec to run."""
+
+    methods: tuple[str, ...] = ()
+    """Names in the spec; empty: all that need not be named."""
+    seeds: tuple[int, ...] = ()
+    """Empty: those of the spec."""
+    iterations: int = 0
+    """See `Spec.iterations`."""
+
+    def of(self, spec: Spec) -> Spec:
+        """The part of a spec, with the claims that are left; it may have no methods."""
+        methods = {
+            name: about
+            for name, about in spec.methods.items()
+            if (name in self.methods if self.methods else not about.only_if_named)
+        }
+        claims = tuple(claim for claim in spec.claims if {claim.method, claim.than} <= methods.keys())
+        than = spec.compare_with if spec.compare_with in methods else ""
+        seeds, iterations = self.seeds or spec.seeds, self.iterations or spec.iterations
+        return replace(spec, methods=methods, claims=claims, compare_with=than, seeds=seeds, iterations=iterations)
 
 
 @dataclass(frozen=True)

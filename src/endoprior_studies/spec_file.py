@@ -22,7 +22,7 @@ from endoprior.evaluation.registry import all_scores
 from endoprior.model.presets import preset_names
 
 from .method import PICTURES, method_names
-from .spec import MatchSpec, MethodSpec, SequenceSpec, Spec, cells
+from .spec import Choice, MatchSpec, MethodSpec, SequenceSpec, Spec, cells
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
@@ -75,12 +75,13 @@ def _specs(folder: Path, pattern: str) -> list[Path]:
     return sorted(path for path in folder.glob(pattern) if path.suffix in READERS and path.name[0] != "_")
 
 
-def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
+def load_spec(path: Path, data: dict[str, Path] | None = None, choice: Choice | None = None) -> Spec:
     """Read and check a spec.
 
     Args:
         path: `.yaml`, `.yml` or `.toml`.
         data: folders of sequences by name; they override those of the file.
+        choice: the part of it to run; None is everything.
     Raises:
         InputError: naming the file, the field, what is expected and what is there.
     """
@@ -97,24 +98,30 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
                 raise InputError(f"--data {name}: expected one of {', '.join(spec.sequences)}. Fix: Correct the name.")
             known = replace(spec.sequences[name], path=str(folder.absolute()), phantom=None)
             spec = replace(spec, sequences=spec.sequences | {name: known})
+        spec = choice.of(spec) if choice else spec
         _check(spec)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return spec
 
 
-def load_specs(paths: list[Path], data: dict[str, Path]) -> dict[Path, Spec]:
-    """Read and check specs, each with the folders in `data` of its own sequences.
+def load_specs(paths: list[Path], data: dict[str, Path], choice: Choice | None = None) -> dict[Path, Spec]:
+    """Read and check specs, each with the folders in `data` of its own sequences; without those that `choice` empties.
 
     Raises:
-        InputError: as `load_spec`; also for a name in `data` that is a sequence of none of them.
+        InputError: as `load_spec`; also for a name in `data` or `choice` that is in none of them.
     """
-    specs = {path: load_spec(path) for path in paths}
+    specs, choice = {path: load_spec(path) for path in paths}, choice or Choice()
     known = {name for spec in specs.values() for name in spec.sequences}
+    methods = sorted({name for spec in specs.values() for name in spec.methods})
+    for name in choice.methods:
+        _demand_one_of("--methods", name, methods)
+    chosen = {}
     for path, spec in specs.items():
-        if own := {name: data[name] for name in data if name in spec.sequences or name not in known}:
-            specs[path] = load_spec(path, own)
-    return specs
+        own = {name: data[name] for name in data if name in spec.sequences or name not in known}
+        if not choice.methods or {*choice.methods} & {*spec.methods}:
+            chosen[path] = load_spec(path, own, choice)
+    return chosen
 
 
 def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
@@ -195,6 +202,7 @@ def _check_names(spec: Spec) -> None:
     for where, what, values in (("protocols", "names", spec.protocols), ("seeds", "numbers", spec.seeds)):
         _demand(len(set(values)) == len(values), where, f"different {what}", f"{[*values]}", "correct them.")
     _demand(spec.seeds, "seeds", "different numbers", "none", "add one.")
+    _demand(spec.iterations >= 0, "iterations", "a number of at least 0", f"{spec.iterations}", "correct it.")
 
 
 def _check_cells(spec: Spec) -> None:

@@ -39,6 +39,11 @@ class Command:
     """Short name -> the option it stands for: `--iterations` -> `--schedule.fine-iterations`."""
 
     @classmethod
+    def more_help(cls) -> list[str]:
+        """Lines of the help page below the options."""
+        return []
+
+    @classmethod
     def from_words(cls, argv: Sequence[str]) -> Self:
         """The command with the arguments that were typed; see `parse`."""
         return parse(cls, argv, cls.__name__.lower())
@@ -114,7 +119,8 @@ def parse(cls: type[C], argv: Sequence[str], command: str, **defaults: Any) -> C
         examples = "".join(f"\n  endoprior {command} {words}".rstrip() for words in cls.examples)
         count = sum(not each.is_positional for each in arguments)
         listed = "" if everything else f"\n\n--help-all lists all {count} options."
-        say(parser.format_help().rstrip() + (f"\n\nexamples:{examples}" if examples else "") + listed)
+        more = "".join(f"\n{line}" for line in ["", *cls.more_help()]) if cls.more_help() else ""
+        say(parser.format_help().rstrip() + more + (f"\n\nexamples:{examples}" if examples else "") + listed)
         raise SystemExit(0)
     if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in argv):
         fix = "Set the shell variable, or remove the empty argument."
@@ -194,7 +200,7 @@ def _taken(option: Option, name: str) -> dict[str, Any]:
     if option.kind is bool:
         return {"action": "store_false" if name == option.off else "store_true"}
     if option.choices or get_origin(option.kind) is Literal:
-        return {"choices": option.choices or get_args(option.kind)}
+        return {"choices": option.choices or get_args(option.kind), "metavar": option.metavar}
     kind, count = option.kind, None
     if get_origin(kind) is tuple:
         kind, *others = get_args(kind)

@@ -24,6 +24,7 @@ OPTIONAL = {
     "networks": "network scores",
     "poses": "camera path by COLMAP",
     "ray": "trainings on a cluster",
+    "tensorboard": "curves of a training in TensorBoard",
     "tools": "tool masks by SAM 2",
 }
 """Optional part of the installation -> what it is for."""

@@ -83,7 +83,7 @@ class Eval(Command):
         require_writable_folder("--out" if self.out else "RUN", self.out or run)
         self.score_run(on_device(scene, self.device), run)
 
-    def score_run(self, scene: RenderedScene, run: Path, extra: Mapping[str, float] | None = None) -> None:
+    def score_run(self, scene: RenderedScene, run: Path, extra: Mapping[str, float] | None = None) -> Evaluation:
         """Score the `scene` of a run folder, write the two files with these `extra` scores, print a table."""
         from ..evaluation.scoring import evaluate, scored_data
         from ..runs.folder import sequence_of_run
@@ -97,6 +97,7 @@ class Eval(Command):
         result.protocol |= mask_facts(run)
         see = command("render", run, "--split", self.split)
         self._finish(result, sequence, self.out or run, f". To see them: `{see}`")
+        return result
 
     def _score_pictures(self, folder: Path) -> None:
         """Score the rendered frames in `folder` on the sequence that takes the place of the run."""

@@ -12,6 +12,7 @@ from ..data.load import not_a_run
 from ..data.reading import Kind, kind_of
 from ..system.atomic import lies_in, temporary_sibling
 from ..system.console import say
+from ..system.signals import held_back
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene, Scene
@@ -93,8 +94,9 @@ def _require_writable(option: str, path: Path, wanted: Kind, folder: Path) -> No
     try:
         # Not by `tempfile`: on Windows it tries two billion names if the folder is not writable.
         probe = temporary_sibling(folder / "writable")
-        probe.touch()
-        probe.unlink()
+        with held_back():  # a signal between the two would leave the probe
+            probe.touch()
+            probe.unlink()
     except OSError as error:
         got = f"{error.strerror} at {folder}"
         raise input_error(f"{option} {path}", "a writable path", got, "Choose another path.") from None

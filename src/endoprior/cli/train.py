@@ -14,7 +14,7 @@ from ..core.config_io import SHORT_NAMES
 from ..core.shell import command
 from ..data import load_sequence
 from ..model.method import method_of
-from ..model.presets import preset, preset_names
+from ..model.presets import preset, preset_line, preset_names
 from ..runs.folder import config_of_run, read_config, sequence_of_run
 from ..runs.progress import training_progress
 from ..system.console import say
@@ -32,7 +32,7 @@ class Train(Command):
     """Sequence folder: of `endoprior prepare` or a dataset. To resume a run, `--resume RUN` alone is enough."""
     out: Path | None = field(default=None, metadata={"place": "OUT"})
     """Run folder to write."""
-    preset: str = field(default="default", metadata={"choices": preset_names()})
+    preset: str = field(default="default", metadata={"choices": preset_names(), "metavar": "NAME"})
     """Method: a preset of the config."""
     config_file: Path | None = field(default=None, metadata={"name": "config", "metavar": "FILE"})
     """Config of another run (config.json), or YAML with some fields. It overrides the preset; options override it."""
@@ -57,16 +57,23 @@ class Train(Command):
     """Show the scene in a web browser during training. At 127.0.0.1 and --view-port; it slows down training."""
     view_port: int = 8080
     """Port of --view; 0 uses any free port."""
+    tensorboard: bool = False
+    """Also write what TensorBoard shows, made from the log: `tensorboard --logdir RUN`. Needs that package."""
     config: Config = field(default_factory=Config, metadata={"name": ""})
 
     examples = ("DATA RUN", "DATA RUN --iterations 3000 --gaussians 50000", "--resume RUN --iterations 3000")
     basics = (
         "--preset --config --seed --data.first-frames --data.shrink --iterations --resume"
-        " --gaussians --device --view --no-networks --weights-dir"
+        " --gaussians --device --view --tensorboard --no-networks --weights-dir"
     )
     short: ClassVar = {
         f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()
     }
+
+    @classmethod
+    def more_help(cls) -> list[str]:
+        """What each preset is."""
+        return ["presets:", *(f"  {name:<19}{preset_line(name)}" for name in preset_names())]
 
     @classmethod
     def from_words(cls, argv: Sequence[str]) -> Self:
@@ -124,12 +131,14 @@ class Train(Command):
         """Train with this config, write the run folder, score the test split, print the scores."""
         from ..runs.log import missed_tools_line, read_log
         from ..runs.remote import complete_on
+        from ..runs.tensorboard import EventFiles
         from ..runs.train import start_run
         from ..system.ray_cluster import connected
         from ..training.trainer import device_for
 
         out = self.out or self.data
         extends = self.resume and self.iterations == cfg.schedule.total  # 0 if it was not typed
+        events = EventFiles(out) if self.tensorboard else None
         sequence = load_sequence(self.data, cfg.data)
         training = start_run(sequence, cfg, out, resume=self.resume, extends=extends, say=say)
         began = clock.perf_counter()
@@ -140,7 +149,8 @@ class Train(Command):
             else:
                 port = self.view_port if self.view else None
                 with training_progress() as show_progress, live_view(port) as show_scene:
-                    scene = training.complete(show_progress, show_scene, checkpoint_seconds=self.checkpoint_seconds)
+                    observers = [show_progress, show_scene, *([events] if events else [])]
+                    scene = training.complete(*observers, checkpoint_seconds=self.checkpoint_seconds)
         except KeyboardInterrupt:
             say(f"Stopped; the state is saved in {out}. To resume, run the same command with --resume.")
             raise
@@ -153,7 +163,9 @@ class Train(Command):
         scene = scene.to(device_for(cfg.render.backend))  # score on the training device
         try:
             scoring = Eval(out, self.data, networks=self.networks, weights_dir=self.weights_dir)
-            scoring.score_run(scene, out, extra)
+            scores = scoring.score_run(scene, out, extra).scores
+            if events:
+                events.finish(scores, cfg.schedule.total)
             if line := missed_tools_line(out, self.data):
                 say(line)
         except KeyboardInterrupt:

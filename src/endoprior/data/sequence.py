@@ -156,6 +156,10 @@ class FrameSequence:
     def _counts(self, index: int) -> bool:
         return self.frame_weights is None or self.frame_weights[index] > 0
 
+    def all_alike(self) -> FrameSequence:
+        """This sequence with every frame and pixel believed alike, as `data.reliability ignored` has it."""
+        return self._with(frame_weights=None, _read_frame=self._read_frame)
+
     @property
     def left_out(self) -> list[int]:
         """The frames that are neither trained on nor scored, because their weight is 0."""

@@ -19,7 +19,7 @@ from ..core.checks import input_error
 from ..core.config import OWN, Config
 from ..core.config_io import from_dict
 from ..system.arrays_file import ArraySpec
-from ..system.plugins import Registry
+from ..system.plugins import MissingPlugin, Registry
 
 if TYPE_CHECKING:
     from ..core.types import Camera
@@ -88,8 +88,10 @@ def method_named(name: str) -> Method:
     """
     known = METHODS.names()
     if name not in known:
-        fix = "Install endoprior again." if OWN not in known else "Start from its preset, or install its package."
-        raise input_error("method", f"one of {', '.join(known) or 'none'}", f"{name!r:.80}", fix)
+        fix = "Install the package with this plugin" if OWN in known else "Install endoprior again"
+        fix = f"{fix}; `endoprior plugins` lists what is installed."
+        got = f"{name!r:.80}, which no installed package has"
+        raise MissingPlugin(str(input_error("method", f"one of {', '.join(known) or 'none'}", got, fix)))
     found = METHODS.load(name)
     if not isinstance(found, Method):
         raise input_error("method", "a Method", f"{name}, which only trains in a benchmark", "`endoprior bench`.")

@@ -5,6 +5,7 @@ Those of other methods are entry points of the group `endoprior.presets`.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -28,7 +29,9 @@ def preset(name: str = "default", **changes: Any) -> Config:
 
 
 def default() -> Config:
-    """What we recommend: the paper's prior, and motion as temporal coefficients of each Gaussian, seeded by flow.
+    """What we recommend.
+
+    The paper's prior, and motion as temporal coefficients of each Gaussian, seeded by flow.
 
     Its rates suit 1,500 iterations: those of 3DGS are meant for twenty times as many.
     """
@@ -36,7 +39,7 @@ def default() -> Config:
 
 
 def paper() -> Config:
-    """The paper's equations and constants, literally; EndoGaussian's choices where the paper is silent."""
+    """The paper's equations and constants, literally. EndoGaussian's choices where the paper is silent."""
     base = Config()
     return replace(
         base,
@@ -79,7 +82,7 @@ def paper() -> Config:
 
 
 def released() -> Config:
-    """What the authors' released code does where it differs from the paper."""
+    """The authors' released code, where it differs from the paper."""
     base = paper()
     return replace(
         base,
@@ -95,7 +98,7 @@ def released() -> Config:
 
 
 def endogaussian() -> Config:
-    """The baseline, conference version: no prior anywhere, pool sampling, plain 3DGS density control."""
+    """The paper's baseline: no prior, plain 3DGS density control. Conference version, with pool sampling."""
     base = paper()
     return replace(
         base,
@@ -108,7 +111,7 @@ def endogaussian() -> Config:
 
 
 def best() -> Config:
-    """`default` with twice its iterations and nearly twice its Gaussians: the same method, given time."""
+    """`default`, given time. Twice its iterations and nearly twice its Gaussians."""
     base = default()
     return replace(
         base,
@@ -120,7 +123,7 @@ def best() -> Config:
 
 
 def preview() -> Config:
-    """A first look: `default` with a third of its Gaussians and iterations. For small frames; not for scores."""
+    """A first look at small frames, not for scores. `default` with a third of its Gaussians and iterations."""
     base = default()
     return replace(
         base,
@@ -142,6 +145,12 @@ PRESETS = Registry(
     load_module=OWN_PRESETS.__getitem__,
 )
 """The presets above, and those of plugins."""
+
+
+def preset_line(name: str) -> str:
+    """What a preset is, in a few words: the first sentence of its documentation."""
+    text = OWN_PRESETS[name].__doc__ if name in OWN_PRESETS else PRESETS.documentation(name)
+    return re.split(r"(?<=\w)\.(?:\s|$)", text or "", maxsplit=1)[0]
 
 
 def preset_names() -> tuple[str, ...]:

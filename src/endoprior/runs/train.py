@@ -117,7 +117,9 @@ def start_run(
         say(f"note: {note}")
     for field in fields(cfg.data):  # was the sequence read as the config says? Both eyes are in any case
         wanted, found = getattr(cfg.data, field.name), getattr(sequence.reading or cfg.data, field.name)
-        if wanted != found and field.name not in ("format", "eyes"):
+        if (field.name, wanted) == ("reliability", "ignored"):
+            sequence = sequence.all_alike()
+        elif wanted != found and field.name not in ("format", "eyes"):
             got = f"a sequence that was read with {found!r}"
             raise input_error(f"data.{field.name}", repr(wanted), got, "`load_sequence(DATA, config.data)`.")
     if extends and out is not None:

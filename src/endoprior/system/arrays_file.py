@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..core.checks import InputError, input_error
 from .atomic import whole_file
+from .plugins import MissingPlugin
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -63,8 +64,8 @@ def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, An
     with whole_file(path) as temporary:
         # The library writes to a temporary sibling of its own, which would remain after a kill.
         staging = temporary.with_name(f"{temporary.name}.staging")
-        staging.mkdir()
         try:
+            staging.mkdir()
             save_file(stored, staging / "arrays", {KEY: text})
             (staging / "arrays").replace(temporary)
         finally:
@@ -124,10 +125,12 @@ def load_facts(path: Path, file_format: str, fix: str) -> dict[str, Any]:
 def rejecting(path: Path, expected: str, fix: str, *others: type[Exception]) -> Iterator[None]:
     """Convert all errors that a wrong file can cause, including `others`, to an InputError about the file.
 
-    An InputError passes; the file name is added if it is missing.
+    An InputError passes; the file name is added if it is missing. A MissingPlugin keeps its fix.
     """
     try:
         yield
+    except MissingPlugin as error:
+        raise MissingPlugin(f"{path}: {error}") from None
     except InputError as error:
         if str(error).startswith(f"{path}:"):
             raise

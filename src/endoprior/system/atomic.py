@@ -107,12 +107,12 @@ def whole_folder(path: Path) -> Iterator[Path]:
     reject_occupied(path)
     temporary = temporary_sibling(path.absolute())
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-    except OSError as error:
-        got = error.strerror or str(error)
-        raise input_error(path, "a path where a folder can be created", got, "Choose another path.") from error
-    try:
+        try:
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir(parents=True)
+        except OSError as error:
+            got = error.strerror or str(error)
+            raise input_error(path, "a path where a folder can be created", got, "Choose another path.") from error
         with writing(path):
             yield temporary
             complete_folder(temporary, path)

@@ -6,11 +6,14 @@ asks for it by name ends with an error.
 
 from __future__ import annotations
 
+import ast
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ..core.checks import InputError, input_error
@@ -19,6 +22,10 @@ from .console import complain
 T = TypeVar("T")
 OWN_PACKAGE = "endoprior"
 """Its entry points are built in: no other package can have their names."""
+
+
+class MissingPlugin(InputError):
+    """A file needs a plugin that no installed package has. The file itself may be whole."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +123,20 @@ class Registry(Generic[T]):
     def origin(self, name: str) -> str:
         """Package and version that a plugin comes from; empty for what is built in."""
         return "" if name in self.builtin else self._plugins()[name].origin
+
+    def documentation(self, name: str) -> str:
+        """The docstring of a plugin's function, or of its module; it is read, not imported. Empty where there is none.
+
+        To import all plugins only to list them would take seconds.
+        """
+        module, _, attribute = self._plugins()[name].entry.value.partition(":")
+        try:
+            spec = find_spec(module)
+            tree = ast.parse(Path(spec.origin or "").read_text(encoding="utf-8")) if spec else ast.Module([], [])
+        except (ImportError, OSError, ValueError, SyntaxError):
+            return ""
+        named = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == attribute]
+        return ast.get_docstring(named[0] if named else tree) or ""
 
     def failure(self, name: str, error: Exception) -> str:
         """What to say of an error inside a plugin: `mae of endoprior-example 0.1 failed: KeyError: 'x' (mae.py:9)`."""

@@ -37,6 +37,18 @@ def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
             signal.signal(number, before[number])
 
 
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Let these signals wait until the block, which must be short, is done."""
+    heard = list[int]()
+    try:
+        with handled_by(lambda number, _frame: heard.append(number)):
+            yield
+    finally:
+        for number in heard[:1]:
+            signal.raise_signal(number)
+
+
 def all_interrupt() -> AbstractContextManager[None]:
     """Let each of these signals raise KeyboardInterrupt, so that what is cleaned up after Ctrl-C always is."""
     last = -REPEAT_S

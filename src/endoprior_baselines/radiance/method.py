@@ -1,4 +1,4 @@
-"""The methods that are radiance fields."""
+"""Radiance fields, EndoNeRF and EndoSurf: slow on a CPU."""
 
 from __future__ import annotations
 
