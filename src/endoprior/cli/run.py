@@ -144,7 +144,7 @@ def _part_words(job: Job) -> str:
     words = f"{job.source}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
     if not part.is_whole:
         words += f" from {part.start:g} s on (--start and --end choose another part)"
-    return "\n".join([*(job.choice.words(job.source, job.out) if job.choice else []), words])
+    return "\n".join([*(job.choice.words(job.source, job.out, job.options) if job.choice else []), words])
 
 
 def last_words(verdict: Verdict | None, took: str, player: Path) -> str:

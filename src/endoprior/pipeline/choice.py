@@ -5,13 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ..core.checks import input_error
-from ..core.shell import command
+from ..core.shell import command, command_of
 from ..data.files import read_json
 from ..prepare.first_pass import source_facts
 from ..prepare.scan import scan_video
@@ -43,7 +45,7 @@ class Choice:
         """Start and end of what is used, s."""
         return self.segments[self.number - 1].best if self.number else (0.0, math.inf)
 
-    def words(self, video: Path, out: Path) -> list[str]:
+    def words(self, video: Path, out: Path, options: Mapping[str, tuple[str, ...]] = MappingProxyType({})) -> list[str]:
         """What is used, why, and the commands for the other segments; nothing if the whole video is one segment."""
         lost = {each.reason: 0.0 for each in self.stretches if each.reason}
         for each in self.stretches:
@@ -61,7 +63,7 @@ class Choice:
         lines.append(f"{whole}, in no segment: {bad}" if bad else f"{whole}; the rest are other scenes, or more of it")
         for i in [each for each in ranked if each != self.number - 1][:MOST_NAMED]:
             other, folder = self.segments[i], out.with_name(f"{out.name}_segment_{i + 1}")
-            again = command("run", video, folder, "--segment", str(i + 1))
+            again = command_of("run", (video, folder), {**options, "--segment": (str(i + 1),)})
             lines.append(f"  {other.best[0]:.1f}-{other.best[1]:.1f} s, score {other.score:.1f}: `{again}`")
         return [
             *lines,
