@@ -84,7 +84,8 @@ def test_a_cut_is_a_cut_and_not_an_exposure_jump():
 def test_blur_and_other_colors_are_detected():
     images = clip()
     images[6] = cv2.GaussianBlur(images[6], (0, 0), 4)
-    images[18] = np.ascontiguousarray(images[18][..., [1, 0, 2]])
+    images[12] = np.ascontiguousarray(images[12][..., [1, 0, 2]])  # white balance: the same view in another color
+    images[18] = np.ascontiguousarray(images[18][::-1, ::-1, [1, 0, 2]])
     found = find_changes(images)
     assert found.blurred == (6,) and found.off_color == (18,)
 

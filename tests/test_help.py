@@ -19,6 +19,7 @@ from endoprior.model.presets import preset, preset_names
 
 MOST_LINES = {"train": 62}  # it lists the presets
 VALUES = {
+    "--events": "blur:1-2",
     int: 1,
     float: 300,
     Path: "x",

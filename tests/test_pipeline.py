@@ -247,7 +247,7 @@ def test_a_camera_that_is_lost_ends_the_training_frames(video, tmp_path):
     about = job.data / "sequence.json"
     lost = list(range(22, FRAMES))
     about.write_text(json.dumps(json.loads(about.read_text()) | {"unexplained_frames": lost}))
-    assert "at frame 22" in run_step(STEPS[2], job, quiet)[0]
+    assert "uses frames 0-21" in run_step(STEPS[2], job, quiet)[0]
     assert len(load_scene(job.run).cameras) == 22
 
 

@@ -71,12 +71,14 @@ def test_times_are_those_of_evenly_spaced_frames():
     assert every_kth_time(10, 0.2) == [0]
 
 
-def test_frames_end_where_the_camera_is_lost():
-    assert usable_frames(100, [], []) == 100
-    assert usable_frames(100, [33, 60], []) == 100, "single frames are blurred, the camera is not lost"
-    assert usable_frames(100, list(range(40, 100)), []) == 40
-    assert usable_frames(100, list(range(40, 100)), [30]) == 30
-    assert usable_frames(100, list(range(7, 100)), []) == 100, "too few frames would be left"
+def test_the_longest_stretch_with_a_pose_is_used():
+    assert usable_frames(100, [], []) == (0, 100)
+    assert usable_frames(100, [33, 60], []) == (0, 100), "single frames are blurred, the camera is not lost"
+    assert usable_frames(100, list(range(40, 100)), []) == (0, 40)
+    assert usable_frames(100, list(range(40, 100)), [30]) == (0, 30)
+    assert usable_frames(100, list(range(7, 20)), []) == (20, 100), "the first loss comes early"
+    assert usable_frames(100, [0, 1, 99], [60]) == (2, 60)
+    assert usable_frames(100, list(range(7, 100)), []) == (0, 100), "too few frames would be left"
 
 
 def test_durations_are_readable():

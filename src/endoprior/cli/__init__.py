@@ -25,6 +25,7 @@ COMMANDS = {
     "run": ("run", "from a video to a model to look at: prepare, check, train, score, video, player"),
     "demo": ("phantom", "phantom sequence -> train -> eval -> render, with a summary and pictures"),
     "phantom": ("phantom", "write a synthetic surgical sequence with full ground truth"),
+    "scan": ("scan", "look through a whole video: which segments can become a model, and why the rest not"),
     "sample": ("sample", "write a made-up stereo video with calibration, to try `run` and `prepare`"),
     "prepare": ("prepare", "write a sequence folder from a video: rectified frames, depth, tool masks, poses"),
     "masks": ("masks", "find the tools in a sequence folder and write their masks"),

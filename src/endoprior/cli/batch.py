@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -18,13 +17,12 @@ from ..data.reading import kind_of, read_text
 from ..system.console import say
 from .arguments import Command, option_name
 from .devices import with_device
-from .paths import require_writable_folder
-from .progress import Counting, step_progress
+from .jobs import do_all
 from .run import Run
 from .train import Train, require_gaussians
 
 if TYPE_CHECKING:
-    from ..pipeline import Entry, Outcome, SequenceJob
+    from ..pipeline import Entry, SequenceJob
 
 NAME = re.compile(r"[^\W_][\w .+-]*")
 """A name of a folder."""
@@ -55,56 +53,7 @@ class Batch(Command):
 
     def execute(self) -> int:
         """Do every job of the list and write the table; 1 if one failed."""
-        from ..pipeline import SUMMARY, TABLE, run_here, run_on, write_summary
-        from ..runs import kernel_cache
-        from ..runs.folder import LOCK
-        from ..system.file_lock import locked
-        from ..system.ray_cluster import connected
-
-        entries = entries_of(self.list, self.out, cache(say))
-        require_writable_folder("OUT", self.out)
-        waiting = [entry for entry in entries if not entry.is_done]
-        say(f"{self.list}: {len(entries)} jobs, {len(entries) - len(waiting)} done before")
-        for entry in waiting:
-            kernel_cache.fill(entry.job.cfg, say)
-        outcomes = []
-        with connected(self.ray, say) if self.ray and waiting else nullcontext() as cluster:
-            self.out.mkdir(parents=True, exist_ok=True)
-            with locked(self.out, self.out / LOCK):
-                try:
-                    for outcome in run_on(cluster, entries, say) if cluster else run_here(entries, _shown):
-                        _tell(outcome)
-                        outcomes.append(outcome)
-                except KeyboardInterrupt:
-                    say("Stopped. To resume, run the same command again.")
-                    raise
-                outcomes.sort(key=lambda outcome: entries.index(outcome.entry))
-                lines = write_summary(outcomes, self.out)
-        for line in ("", *lines, f"\nThis table: {self.out / SUMMARY}; all scores: {self.out / TABLE}"):
-            say(line)
-        return 1 if any(outcome.failure for outcome in outcomes) else 0
-
-
-def _shown(entry: Entry, step: str) -> AbstractContextManager[Counting]:
-    """The progress of a step of a job in this process."""
-    from ..pipeline import steps_of
-
-    names = [f"{entry.name}: {each.name}" for each in steps_of(entry.job)]
-    return step_progress(names, f"{entry.name}: {step}")
-
-
-def _tell(outcome: Outcome) -> None:
-    """Say how a job ended, with the notes of its steps."""
-    from ..pipeline import notes_of, steps_of
-
-    entry = outcome.entry
-    if outcome.failure:
-        say(f"{entry.name}: failed: {outcome.failure}")
-        return
-    say(f"{entry.name}: done: {entry.job.out}")
-    for step in steps_of(entry.job):
-        for line in notes_of(step, entry.job):
-            say(f"     {line}")
+        return do_all(entries_of(self.list, self.out, cache(say)), self.out, str(self.list), self.ray)
 
 
 def entries_of(file: Path, out: Path, tell: Callable[[str], None]) -> list[Entry]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from .progress import Counting
 if TYPE_CHECKING:
     from ..prepare.folder_path import FolderPath
 
+MOST_NAMED = 5  # times that a note names; more are counted
 TRUTH = Path("truth", "camera_to_world.npy")
 
 
@@ -49,13 +51,29 @@ class Prepare(Command):
 
         with Counting() as progress:
             done = prepare(self.video, self.out, self.config, progress)
-        for note in done.notes:
+        for note in [*done.notes, *self._segments()]:
             say(f"note: {note}")
         say(f"note: {done.out / RECORD} holds the path of your video; delete it before you share the folder")
         say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
         if f"no {TOOLS_FOUND}" in read_description(done.out / "sequence.json").get("sources", {}).get("masks", ""):
             say(f"no tools were found; if there are any, paint them: `{command('view', done.out)}`")
         say(f"next: `{command('check', done.out)}` and `{command('train', done.out, 'RUN')}`")
+
+    def _segments(self) -> list[str]:
+        """Which times of a video that is used as a whole are not clear, and the command for the best part."""
+        from ..pipeline.choice import choose_segment
+
+        if (self.config.start, self.config.end, self.config.stir) != (0, math.inf, None):
+            return []
+        choice = choose_segment(self.video, self.out, self.config.folder_rate)
+        bad = [f"{each.start:.1f}-{each.end:.1f} s {each.reason}" for each in choice.stretches if each.reason]
+        if not choice.number:
+            return []
+        named = ", ".join(bad[:MOST_NAMED]) + (f" and {len(bad) - MOST_NAMED} more" if bad[MOST_NAMED:] else "")
+        start, end = (f"{time:.2f}" for time in choice.span)
+        best = command("prepare", self.video, "OUT", "--start", start, "--end", end)
+        what = f"in no segment: {named}" if bad else f"{len(choice.segments)} scenes"
+        return [f"the whole video is used; {what}. The best part: `{best}`"]
 
 
 @dataclass

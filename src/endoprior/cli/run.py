@@ -16,6 +16,8 @@ from ..prepare.config import PrepareConfig
 from ..system.console import say
 from .arguments import Command
 from .devices import Wanted, with_device
+from .jobs import do_all
+from .paths import require_writable_folder
 from .progress import duration, step_head, step_progress
 from .train import require_gaussians
 
@@ -38,6 +40,10 @@ class Run(Command):
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
     """A first look in about a minute: at most 60 frames, 320 px wide. Not for scores."""
+    segment: int = 0
+    """Segment of `endoprior scan` to use, from 1; 0 is the best one. --start or --end choose any part."""
+    all_segments: bool = False
+    """A model of every segment, each in a folder of its own in OUT, as `endoprior batch` makes them."""
     preset: str = field(default="default", metadata={"choices": preset_names()})
     """Preset of the training; --preview has its own."""
     seed: int = 0
@@ -47,15 +53,17 @@ class Run(Command):
     config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
     examples = ("video.mp4 OUT --preview", "video.mp4 OUT", "stereo.mp4 OUT --calibration calib.yaml")
-    basics = "--preview --start --end --calibration --right --depth --masks --preset --device"
+    basics = "--preview --segment --all-segments --start --end --calibration --right --depth --masks --preset --device"
 
-    def execute(self) -> None:
+    def execute(self) -> int | None:
         """Do every step, with one progress display."""
         from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of, verdict_of
         from ..runs import kernel_cache
         from ..runs.log import missed_tools_line
 
         began = clock.perf_counter()
+        if self.all_segments:
+            return self._run_all()
         job = self.job(say)
         resumes = open_folder(job)
         say(_part_words(job) if isinstance(job, Job) else f"{job.source}: a sequence folder, trained as it is")
@@ -93,7 +101,10 @@ class Run(Command):
         from ..pipeline import SequenceJob, make_job
 
         is_prepared = is_sequence(self.video)
-        if is_prepared and (useless := ["--preview"] * self.preview + list(changed_options(self.config))):
+        chosen = ["--segment"] * bool(self.segment) + ["--all-segments"] * self.all_segments
+        if chosen and (other := {"--start", "--end", "--stir"} & {*changed_options(self.config)}):
+            raise input_error(chosen[0], f"no {min(other)}", f"{chosen[0]} and {min(other)}", "Remove one of them.")
+        if is_prepared and (useless := ["--preview"] * self.preview + chosen + list(changed_options(self.config))):
             fix = f"Remove {useless[0]}{', or use `--preset preview`' * self.preview}."
             raise input_error(useless[0], "a video to prepare", f"{self.video}, a sequence folder", fix)
         cfg = replace(preset("preview" if self.preview else self.preset), seed=self.seed)
@@ -101,7 +112,29 @@ class Run(Command):
         cfg = with_device(cfg, self.device, tell)
         if is_prepared:
             return SequenceJob(self.video, self.out, cfg)
-        return make_job(self.video, self.out, self.config, cfg, preset=self.preset, preview=self.preview)
+        return make_job(
+            self.video, self.out, self.config, cfg, preset=self.preset, preview=self.preview, segment=self.segment
+        )
+
+    def _run_all(self) -> int:
+        """The segments one after the other, in folders of `out`; 1 if one failed."""
+        if is_sequence(self.video) or {"--start", "--end", "--stir"} & {*changed_options(self.config)}:
+            self.job(say)  # says what contradicts
+        require_writable_folder("OUT", self.out)
+        from ..pipeline import Entry
+        from ..pipeline.choice import SCAN, choose_segment
+        from ..system.atomic import write_json
+
+        choice = choose_segment(self.video, self.out, self.config.folder_rate)
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_json(self.out / SCAN, choice.scanned)  # where the jobs find it
+        numbers = range(1, len(choice.segments) + 1) if choice.number else [0]
+        entries = [
+            Entry(name, replace(self, out=self.out / name, segment=number, all_segments=False).job(say))
+            for number in numbers
+            for name in [f"segment_{number}" if number else "whole"]
+        ]
+        return do_all(entries, self.out, str(self.video))
 
 
 def _part_words(job: Job) -> str:
@@ -109,7 +142,9 @@ def _part_words(job: Job) -> str:
     part = job.part
     seconds = part.num_frames / part.frames_per_second
     words = f"{job.source}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
-    return words if part.is_whole else f"{words} from {part.start:g} s on (--start and --end choose another part)"
+    if not part.is_whole:
+        words += f" from {part.start:g} s on (--start and --end choose another part)"
+    return "\n".join([*(job.choice.words(job.source, job.out, job.options) if job.choice else []), words])
 
 
 def last_words(verdict: Verdict | None, took: str, player: Path) -> str:

@@ -14,7 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask
+from .components import Image, Mask, runs
+from .disturbances import disturbances
+from .frame_quality import measure_quality, small_size
+from .same_view import View, same_view
 
 THUMB_WIDTH = 160  # Images are compared at this width, px
 SAME_LEVELS = 0.03  # Images with a smaller mean difference, in levels of 255, are duplicates
@@ -26,10 +29,13 @@ JUMP_RATIO = 6.0  # An exposure jump is this many times the usual change of brig
 JUMP_AGREEMENT = 0.85
 """... and this share of the image changes in the same direction. A tool that enters darkens only a part."""
 CUT_CORRELATION = 0.4  # Successive images of one scene have a higher correlation
+ACROSS = (1, 3, 6)  # Tissue is looked for in images so far before and after what looks like a cut
 BLUR_RATIO = 0.45  # An image is blurred if its sharpness is below this share of that of its neighbors
 NEIGHBORS = 5  # Number of images on each side that define the usual value
 COLOR_DISTANCE = 0.07
 """An image shows another scene if its mean red or green share differs by this from the median of the clip."""
+FOLLOWS = 0.9  # An image that follows from the one before has at least this correlation with it
+USUAL_RATE = 25.0  # Frame rate, 1/s, which decides how many images around an image it is compared with
 BLOCK_PX = 16
 LEAST_DIFFERENCE = 3.0  # Mean difference of neighboring rows, of 255, above which a block has structure
 RATIO = 1.3
@@ -50,21 +56,26 @@ class Changes:
     exposure_jumps: tuple[int, ...]  # Images that are suddenly brighter or darker than the one before
     cuts: tuple[int, ...]  # Images that show another view than the one before
     blurred: tuple[int, ...]  # Images much less sharp than their neighbors
-    off_color: tuple[int, ...]  # Images of another color than the clip: outside the body, or covered by smoke or blood
+    off_color: tuple[int, ...]  # Images of another color than the clip, which do not follow from it: outside the body
+    weights: NDArray[np.float64]  # (T,) how far each is to be believed, in [0, 1]: 1, or less where smoke or blur lies
 
 
 def find_changes(images: Iterable[Image]) -> Changes:
     """Measure the curves and detect conspicuous images, of T >= 1 images (H, W, 3) of one size; each is used once."""
-    thumbs, sharpness, shares = [], [], []
+    thumbs, sharpness, shares, qualities = [], [], [], []
     for image in images:
         size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * image.shape[0] / image.shape[1]))
         color = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         thumbs.append(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
         shares.append(color_share(color))
         sharpness.append(_sharpness(image))
+        small = cv2.resize(image, small_size(image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
+        qualities.append(measure_quality(np.asarray(small, np.uint8), np.ones(small.shape[:2], bool)))
     pairs, sharp = list(pairwise(thumbs)), np.array(sharpness)
     difference = np.array([np.abs(now - before).mean() for before, now in pairs], np.float64)
-    cuts = tuple(i for i, pair in enumerate(pairs, 1) if _correlation(*pair) < CUT_CORRELATION)
+    cuts = tuple(i for i, pair in enumerate(pairs, 1) if _correlation(*pair) < CUT_CORRELATION and _is_cut(thumbs, i))
+    scene = np.isin(np.arange(len(thumbs)), cuts).cumsum()
+    off_color = np.abs(shares - np.median(shares, axis=0)).max(1) > COLOR_DISTANCE
     return Changes(
         np.array([thumb.mean() for thumb in thumbs], np.float64) / 255,
         difference,
@@ -73,7 +84,8 @@ def find_changes(images: Iterable[Image]) -> Changes:
         exposure_jumps=tuple(i for i in _exposure_jumps(pairs) if i not in cuts),
         cuts=cuts,
         blurred=_places(sharp < BLUR_RATIO * np.array([np.median(window) for window in _windows(sharp)])),
-        off_color=_places(np.abs(shares - np.median(shares, axis=0)).max(1) > COLOR_DISTANCE),
+        off_color=_places(_of_other_scenes(off_color, thumbs)),
+        weights=disturbances(np.arange(len(thumbs)) / USUAL_RATE, qualities, scene)[1],
     )
 
 
@@ -130,6 +142,24 @@ def _correlation(a: NDArray, b: NDArray) -> float:
     a, b = a - a.mean(), b - b.mean()
     energy = float(np.sqrt((a * a).mean() * (b * b).mean()))
     return 1.0 if energy < 1e-3 else float((a * b).mean()) / energy
+
+
+def _of_other_scenes(off_color: Mask, thumbs: Sequence[NDArray]) -> Mask:
+    """(T,) True in those runs of images of another color that do not follow from the images before or lead to those
+    after: white balance, smoke and blood change the color, too.
+    """
+    found = np.zeros(len(thumbs), bool)
+    for first, end in runs(off_color):
+        edges = [i for i in (first, end) if 0 < i < len(thumbs)]
+        found[first:end] = all(_correlation(thumbs[i - 1], thumbs[i]) < FOLLOWS for i in edges)
+    return found
+
+
+def _is_cut(thumbs: Sequence[NDArray], first: int) -> bool:
+    """Whether no tissue of before is found from image `first` on. Smoke, blur and a tool that moves are no cuts."""
+    places = [[first - k for k in ACROSS if k <= first], [first - 1 + k for k in ACROSS if first - 1 + k < len(thumbs)]]
+    before, after = ([View(thumbs[i].astype(np.uint8)) for i in side] for side in places)
+    return not same_view(before, after)
 
 
 def is_combed(rgb_u8: Image) -> bool:

@@ -47,3 +47,9 @@ def square(reach: int) -> NDArray[np.uint8]:
 def disk(radius: int) -> NDArray[np.uint8]:
     """Structuring element of that radius, px."""
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
+
+
+def runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """(first, end) of each stretch of True values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from ..core.checks import input_error
+from .events import parse_events
 
 MOST_PIXELS = 3840 * 2160
 GB_PER_PIXEL = 1.3e-6
@@ -84,6 +85,8 @@ class PhantomConfig:
     """Standard deviation of the sensor noise at mid gray, in 8-bit levels, 0..20."""
     depth_noise_px: float = 0.16
     """Standard deviation of the disparity error of `depth/`, in px of a 640 px wide image, 0..2."""
+    events: str = ""
+    """What disturbs frames: `blur:10-14,white-out:20-22,out-of-body:30-40,cut:45`, see `truth/scene.json`."""
     tracks: int = 256
     """Number of material points in `truth/tracks.npz`, 1..20000."""
 
@@ -111,6 +114,7 @@ class PhantomConfig:
         for name, known in ((name, get_args(kinds)) for name, kinds in choices.items()):
             if getattr(self, name) not in known:
                 raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
+        parse_events(self.events, self.frames)
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
         if self.width * self.height * share > MOST_PIXELS:
@@ -134,8 +138,9 @@ class PhantomConfig:
 
     @property
     def has_kinds(self) -> bool:
-        """Whether tools, tissue or light are others than the default; without, files are those of earlier versions."""
-        return self.instruments != "graspers" or self.tissue != "bowel" or self.smoke > 0 or self.gain == "auto"
+        """Whether what is shown is other than the default; without, files are those of earlier versions."""
+        others = self.smoke > 0 or self.gain == "auto" or bool(self.events)
+        return self.instruments != "graspers" or self.tissue != "bowel" or others
 
     @property
     def focal(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from ..data.sequence import is_test_frame
 from ..data.writer import FrameFiles, SequenceMeta, new_sequence
 from .camera import STILL, Eye
 from .config import PhantomConfig
+from .events import Event, disturbed, is_mirrored, parse_events, shows_body
 from .scene import Moment, Scene, build_scene
 from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth, vignette
 from .surround import border, overlay, surrounded
@@ -75,9 +77,9 @@ def write_phantom(
     - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
       0 where the endoscope does not see the tissue; `truth/side/world_to_camera.json` has their poses (4, 4);
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
-    - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, the density of smoke in
-      each frame, 0..1, and its exposure relative to the first one. `truth/tissue` has the exposure of the first frame
-      and shows the smoke of `cfg.tissue`, not that of `cfg.smoke`; the side cameras see none;
+    - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, events, the density of
+      smoke in each frame, 0..1, and its exposure relative to the first one. `truth/tissue` has the exposure of the
+      first frame and shows the smoke of `cfg.tissue`, not that of `cfg.smoke`; the side cameras see none;
     - with `cfg.border` `truth/border.npy`, (H, W) bool, True outside; with `cfg.overlay` `truth/overlay/*.npy`, True
       on the drawing;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
@@ -97,6 +99,7 @@ def write_phantom(
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
         points, visible, gains, sides, gain, first_gain, wanted = [], [], [], {}, 0.0, 0.0, 0.0
+        events = parse_events(cfg.events, cfg.frames)
         ever_seen, behind_tools = np.zeros(scene.a.shape, bool), {}
         for index in range(cfg.frames):
             now = Moment.of(scene, index / (cfg.frames - 1))
@@ -116,20 +119,24 @@ def write_phantom(
             if cfg.stereo:
                 other = render_view(scene, now, Eye.moved(cfg.baseline_mm))
                 right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
-                right = surrounded(right, outside, drawn)
-            writer.write_image("truth/tissue", np.round(develop(view.tissue, first_gain, lens)).astype(np.uint8))
-            writer.write_array(f"truth/depth/{index:06d}.npy", z)
+            measured = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
+            turned = slice(None, None, -1) if is_mirrored(events, index) else slice(None)
+            tissue = np.round(develop(view.tissue, first_gain, lens)).astype(np.uint8)
+            writer.write_image("truth/tissue", tissue[turned])
+            writer.write_array(f"truth/depth/{index:06d}.npy", z[turned])
             seen = visible_points(now.vertices, z, mask, cfg)
             points.append(now.vertices[tracked[:, 0], tracked[:, 1]])
-            visible.append(seen[tracked[:, 0], tracked[:, 1]])
+            is_clear = shows_body(events, index) and not is_mirrored(events, index)
+            visible.append(seen[tracked[:, 0], tracked[:, 1]] & is_clear)
             if is_test_frame(index):
                 behind_tools[index] = np.packbits(mask)
                 _write_sides(writer, sides, index, (scene, now, z, mask, first_gain))
             else:
                 ever_seen |= seen
-            depth = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
-            depth[outside] = 0
-            writer.add(surrounded(image, outside, drawn), mask | outside | drawn, depth, right)
+            image, mask, measured, right = _disturbed((image, mask, measured, right), events, index, cfg.seed)
+            measured[outside] = 0
+            right = None if right is None else surrounded(right, outside, drawn)
+            writer.add(surrounded(image, outside, drawn), mask | outside | drawn, measured, right)
             if cfg.gain == "auto":
                 gain = next_gain(gain, metered(view.image), wanted)
             progress(index + 1, cfg.frames)
@@ -141,6 +148,19 @@ def write_phantom(
         tracks = {"points": np.stack(points).astype(np.float32), "visible": np.stack(visible)}
         writer.write_arrays("truth/tracks.npz", **tracks, **regions)
         _write_descriptions(writer, scene, sides, gains)
+
+
+def _disturbed(
+    frame: tuple[NDArray, NDArray, NDArray, NDArray | None], events: tuple[Event, ...], index: int, seed: int
+) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
+    """Image, tool mask, measured depth and right image of a frame as its events leave them."""
+    turned = slice(None, None, -1) if is_mirrored(events, index) else slice(None)
+    image, mask, measured, right = (None if each is None else np.ascontiguousarray(each[turned]) for each in frame)
+    assert image is not None and mask is not None and measured is not None
+    if not shows_body(events, index):
+        mask, measured = np.zeros_like(mask), np.zeros_like(measured)
+    right = None if right is None else disturbed(right, events, index, seed)
+    return disturbed(image, events, index, seed), mask, measured, right
 
 
 def _write_sides(
@@ -185,6 +205,8 @@ def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye],
     if cfg.has_kinds:
         tools = [tool.name for tool in scene.instruments]
         described: dict[str, object] = {"instruments": cfg.instruments, "tools": tools, "tissue": cfg.tissue}
+        if cfg.events:
+            described["events"] = [asdict(event) for event in parse_events(cfg.events, cfg.frames)]
         if scene.smoke is not None:
             described["smoke"] = [round(scene.smoke.density(k / (cfg.frames - 1)), 4) for k in range(cfg.frames)]
         if cfg.gain == "auto":

@@ -27,6 +27,7 @@ from ..prepare.video_clip import FrameSelection, Moment
 from ..prepare.work_folder import work_lock
 from ..system.atomic import reject_occupied, write_json
 from ..system.file_lock import locked
+from .choice import SCAN, Choice, choose_segment
 
 LEAST_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed
 MOST_FRAMES = 10_000
@@ -121,6 +122,7 @@ class Job(SequenceJob):
     options: Options  # what the user chose, as it is typed: `{"--preview": (), "--end": ("2.5",)}`; all else follows
     prepare: PrepareConfig  # options of `prepare`, for `part` only
     part: Part
+    choice: Choice | None = None  # the segment that was chosen; None if the user chose the part
 
     @property
     @override
@@ -134,13 +136,16 @@ class Job(SequenceJob):
 
 
 def make_job(
-    video: Path, out: Path, prepare: PrepareConfig, cfg: Config, *, preset: str = "default", preview: bool = False
-) -> Job:
+    video: Path, out: Path, prepare: PrepareConfig, cfg: Config, *, preset: str = "default", preview: bool = False,
+    segment: int = 0,
+) -> Job:  # fmt: skip
     """Choose the part of the video and the sizes.
 
     Args:
         prepare: the user's options; frame rate and end are filled in.
         preset: what the user calls `cfg`; a preview has its own.
+        segment: number of a segment of the video's scan, from 1; 0 for the best one. Without effect if `prepare` has a
+            start or an end.
         preview: at most `PREVIEW_FRAMES` frames of at most `PREVIEW_WIDTH` px, and no COLMAP unless it is asked for.
     Raises:
         InputError: the video cannot be read.
@@ -148,13 +153,20 @@ def make_job(
     source = open_source(video, prepare.folder_rate)
     rate = source.frames_per_second
     most, usual = (PREVIEW_FRAMES, PREVIEW_FRAMES) if preview else (MOST_FRAMES, USUAL_FRAMES)
-    part = choose_part(source.times, rate, prepare.frames_per_second, prepare.start, prepare.end, most, usual)
+    choice = None
+    if (prepare.start, prepare.end, prepare.stir) == (0, math.inf, None):
+        choice = choose_segment(video, out, prepare.folder_rate, segment)
+    start, end = choice.span if choice else (prepare.start, prepare.end)
+    part = choose_part(source.times, rate, prepare.frames_per_second, start, end, most, usual)
     width = min(prepare.max_width or PREVIEW_WIDTH, PREVIEW_WIDTH) if preview else prepare.max_width
     poses = WITHOUT_COLMAP["auto"] if preview and prepare.poses == "auto" else prepare.poses
-    chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width, poses=poses)
+    chosen = replace(
+        prepare, frames_per_second=part.frames_per_second, start=start, end=part.end, max_width=width, poses=poses
+    )
     options: Options = {"--preview": ()} if preview else {"--preset": (preset,)} if preset != "default" else {}
     options |= {"--seed": (str(cfg.seed),)} if cfg.seed else {}
-    return Job(video, out, cfg, options | changed_options(prepare), chosen, part)
+    options |= {"--segment": (str(segment),)} if segment else {}
+    return Job(video, out, cfg, options | changed_options(prepare), chosen, part, choice)
 
 
 def open_folder(job: SequenceJob) -> bool:
@@ -170,6 +182,7 @@ def open_folder(job: SequenceJob) -> bool:
         reject_occupied(job.out)
         job.out.mkdir(parents=True, exist_ok=True)
         write_json(file, given)
+        _keep_scan(job)
         return False
     if not (found := differences(read_json(file), given)):
         return True
@@ -179,7 +192,13 @@ def open_folder(job: SequenceJob) -> bool:
         raise input_error(job.out, "results of the same video and options", got, fix)
     with locked(job.out, work_lock(job.out / DATA)):  # else another process prepares it with the stored ones
         write_json(file, given)
+        _keep_scan(job)
     return False
+
+
+def _keep_scan(job: SequenceJob) -> None:
+    if isinstance(job, Job) and job.choice:
+        write_json(job.out / SCAN, job.choice.scanned)
 
 
 @contextmanager
@@ -188,8 +207,9 @@ def removed_if_rejected(job: SequenceJob) -> Iterator[None]:
     try:
         yield
     except InputError:
-        if {entry.name for entry in entries(job.out)} == {SETTINGS}:
-            (job.out / SETTINGS).unlink()
+        if {entry.name for entry in entries(job.out)} <= {SETTINGS, SCAN}:
+            for name in (SETTINGS, SCAN):
+                (job.out / name).unlink(missing_ok=True)
             job.out.rmdir()
         raise
 

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -25,10 +26,12 @@ from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..evaluation.verdict import WORDS, Facts, Verdict, verdict_on
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
+from ..footage.components import runs
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
+from ..prepare.scan_figure import draw_scan
 from ..runs.folder import CHECKPOINT, CONFIG
 from ..runs.log import mask_facts, missed_tools_of
 from ..runs.report import write_report
@@ -37,6 +40,7 @@ from ..system.atomic import write_json
 from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
+from .choice import SCAN
 from .job import Job, SequenceJob
 
 PLAYER_BYTES = 40_000_000  # largest player
@@ -80,6 +84,8 @@ def _stored_notes(job: SequenceJob) -> dict[str, Any]:
 def _prepare(job: SequenceJob, progress: Progress) -> list[str]:
     assert isinstance(job, Job), "a sequence folder is prepared"
     done = prepare(job.source, job.data, job.prepare, progress)
+    if job.choice:
+        draw_scan(job.source, job.choice.scanned, (job.out / SCAN).with_suffix(".png"), job.prepare.folder_rate)
     return [f"{done.num_frames} frames of {done.size[0]}x{done.size[1]}", *(f"note: {note}" for note in done.notes)]
 
 
@@ -109,16 +115,19 @@ def problems(job: SequenceJob) -> str:
 def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[str]]:
     """The run of a job, new or resumed, and lines for the user."""
     sequence = load_sequence(job.data, job.cfg.data)
-    cfg, notes, usable = job.cfg, list[str](), len(sequence)
+    cfg, notes, usable = job.cfg, list[str](), (0, len(sequence))
     if isinstance(job, Job):
         unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
         findings = read_json(job.findings)["findings"]
         cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
         usable = usable_frames(len(sequence), unexplained, cuts)
-    if usable < len(sequence):
-        cfg = replace(cfg, data=replace(cfg.data, first_frames=usable))
+    first, end = usable
+    if end - first < len(sequence):
+        skipped = f"0-{first - 1}" if first > 1 else "0" * first
+        cfg = replace(cfg, data=replace(cfg.data, first_frames=end, skip_frames=skipped))
         sequence = load_sequence(job.data, cfg.data)
-        notes = [f"note: the camera is lost, or the scene changes, at frame {usable}: training uses the frames before"]
+        why = "the camera is lost, or the scene changes, before and after"
+        notes = [f"note: training uses frames {first}-{end - 1}, the longest stretch: {why}"]
     begun = (job.run / CHECKPOINT).is_file() or (job.run / CONFIG).is_file()
     return start_run(sequence, cfg, job.run, resume=begun, say=lambda _text: None), notes
 
@@ -236,14 +245,21 @@ def every_kth_time(num_frames: int, most: float) -> list[float]:
     return [i / num_frames for i in range(0, num_frames, math.ceil(num_frames / max(int(most), 1)))]
 
 
-def usable_frames(num_frames: int, unexplained: list[int], cuts: list[int]) -> int:
-    """Number of frames before the camera is lost or another scene begins; all of them if too few would be left.
+def usable_frames(num_frames: int, unexplained: list[int], cuts: list[int]) -> tuple[int, int]:
+    """First frame, and the frame after the last one, of the longest stretch with a camera pose and without a cut.
+
+    Single frames without a pose do not end it. If it is too short, all frames are used.
 
     Args:
         unexplained: frames without a camera pose, or of another color than the clip.
         cuts: first frames after a scene cut.
     """
-    missing = set(unexplained)
-    lost = [i for i in missing if all(i + k in missing for k in range(LOST_FRAMES))]
-    first = min([num_frames, *lost, *cuts])
-    return first if first >= FEWEST_FRAMES else num_frames
+    missing = np.zeros(num_frames, bool)
+    missing[unexplained] = True
+    ends = np.zeros(num_frames + 1, bool)
+    ends[[0, *cuts, num_frames]] = True
+    for first, end in runs(missing):
+        if end - first >= LOST_FRAMES or first == 0 or end == num_frames:
+            ends[first : end + 1] = True
+    first, end = max(pairwise(np.flatnonzero(ends).tolist()), key=lambda part: part[1] - part[0])
+    return (first, end) if end - first >= FEWEST_FRAMES else (0, num_frames)

@@ -106,12 +106,12 @@ def prepare(
         mark_moving(folder, moving)
         path, motion_notes = _camera_path(cfg, files, first_pass, used, progress)
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
-        unexplained = _unexplained(path, files, damaged)
+        unexplained, weights = _unexplained(path, files, damaged)
         if path is not None:
             _use_path(files, path)
         shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
         RowLog(folder).remove()
-        files.finish(None if path is None else path.camera_to_world, unexplained)
+        files.finish(None if path is None else path.camera_to_world, unexplained, weights.tolist())
         video_notes = [*first_pass.video_notes, *_usage_notes(damaged, len(first_pass.indices) - len(used))]
         _record(video, cfg, first_pass.geometry, video_notes).save(folder)
         if cfg.stir is not None:
@@ -218,13 +218,17 @@ def _use_path(files: FrameFiles, path: CameraPath) -> None:
     files.write_json(PATH_RECORD, path.record())
 
 
-def _unexplained(path: CameraPath | None, files: _Written, damaged: list[int]) -> list[int]:
-    """Damaged frames, and those without a pose or of another scene than the frames that are not damaged."""
-    whole = sorted({*range(files.count)} - {*damaged})
+def _unexplained(path: CameraPath | None, files: _Written, damaged: list[int]) -> tuple[list[int], NDArray[np.float64]]:
+    """Damaged frames, and those without a pose or of another scene than the frames that are not damaged; and weights of
+    all frames, less than 1 where smoke or blur lies on them.
+    """
+    whole, weights = sorted({*range(files.count)} - {*damaged}), np.ones(files.count)
     if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
-        return damaged
-    other_scene = [whole[i] for i in find_changes(map(files.color, whole)).off_color]
-    return sorted({*damaged, *(path.lost if path else []), *other_scene})
+        return damaged, weights
+    changes = find_changes(map(files.color, whole))
+    weights[whole] = changes.weights
+    other_scene = [whole[i] for i in changes.off_color]
+    return sorted({*damaged, *(path.lost if path else []), *other_scene}), weights
 
 
 def _usage_notes(damaged: list[int], outside: int) -> list[str]:

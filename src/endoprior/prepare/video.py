@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -30,6 +31,8 @@ STATES_END = ("matroska,webm", "nut")
 ARBITRARY_CLOCKS = ("mpegts", "mpeg")  # formats whose times do not count from the start of the recording
 PIXEL_ASPECTS = (0.25, 4.0)  # plausible width of a pixel, in heights
 LOOKED_AT = 300  # most images that are decoded to reach the time of a glimpse: as many as between two key frames
+SmallImage = Callable[..., NDArray[np.uint8]]
+"""Called with a width and a height, px: the image (h, w, 3) of that size, or (h, w) gray values with `is_gray`."""
 COPY_AGAIN = "Copy or export it again."
 
 
@@ -137,6 +140,23 @@ class Video:
         }
         self._found += [self._note(words) for words, is_so in particular.items() if is_so]
 
+    def quick_images(self) -> Iterator[tuple[float, SmallImage]]:
+        """Times of the images, s, and functions that give one small; for a first look.
+
+        Images that no other one is predicted from are left out, and blocks are not smoothed: up to four times faster.
+        Stops where the file cannot be read on.
+        """
+        timeline, began = Timeline(self._step), None
+        with self._open() as (container, track):
+            if container.format.name != AVI:  # there, images get their times by counting
+                track.codec_context.skip_frame = "NONREF"
+            track.codec_context.options |= {"skip_loop_filter": "all"}
+            with suppress(FFmpegError):
+                images = decode(container, track, [], weave=True)
+                for image, seconds in timeline.along((image, image.seconds) for image in images):
+                    began = seconds if began is None else began
+                    yield seconds - began, partial(_small, image)
+
     def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole time range, with all their rows; at least one."""
         end = min(end, self.seconds)
@@ -229,6 +249,14 @@ class Video:
             # The size may change later, and that which the container states may be wrong.
             track.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
             yield container, track
+
+
+def _small(image: DecodedImage, width: int, height: int, is_gray: bool = False) -> NDArray[np.uint8]:
+    if image.turns % 2:
+        width, height = height, width
+    kind = "gray8" if is_gray else "rgb24"
+    small = image.frame.reformat(width=width, height=height, format=kind, interpolation="AREA")
+    return np.ascontiguousarray(np.rot90(small.to_ndarray(), image.turns), np.uint8)
 
 
 def demand_size(path: Path, width: int, height: int) -> None:

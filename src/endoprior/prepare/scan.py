@@ -1,0 +1,153 @@
+"""Look through a whole video once, quickly: what its images show, and where it is cut. Memory does not grow with it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..footage.components import runs
+from ..footage.disturbances import disturbances, scenes_outside
+from ..footage.frame_quality import FrameQuality, measure_quality, small_size, view_mask
+from ..footage.same_view import Link, View, feature_link, flow_link
+from ..footage.scenes import THUMB_WIDTH, breaks, change, connected, jumps, standardized
+from .source import Source, open_source, quick_images
+
+LOOKS, RATES = 2400, (2.0, 10.0)
+"""So many images are looked at, if that is not less or more than these rates, 1/s."""
+GLIMPSES = 24  # images that show which part of the frame is the endoscope's image
+BACK_S = 3.0  # tissue is looked for in the images of so long before, s
+BACK = (1, 2, 5, 12, 28)  # how many images before; each costs a comparison of features
+FROZEN = 0.12  # images are the same if their mean difference is below this, levels of 255
+GAP_S = 0.5  # a shorter stretch of clear images between disturbed ones does not count, s
+FROZEN_S = 1.0  # so long that video counts as a still image, s
+OUTSIDE, FROZEN_WORDS = "out of the body", "repeated frames"
+
+
+@dataclass(frozen=True)
+class Look:
+    """One image that was looked at."""
+
+    seconds: float  # since the first image
+    quality: FrameQuality
+    link: Link | None  # motion of the image as a whole since an image before; None: unknown
+    word: str = ""  # what is wrong with it; empty for nothing
+    weight: float = 1.0  # how far it is to be believed, in [0, 1]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a video shows."""
+
+    seconds: float  # duration
+    rate: float  # looks a second, at most
+    looks: list[Look]
+    cuts: list[float]  # times of the first images after cuts, s
+
+
+def scan_video(
+    video: Path, folder_rate: float = 25.0, progress: Callable[[float, float], None] = lambda _done, _all: None
+) -> Scan:
+    """Look through a video.
+
+    Args:
+        folder_rate: frame rate of a folder of images, 1/s.
+        progress: called with the seconds done, and all.
+    Raises:
+        InputError: it cannot be opened.
+    """
+    source = open_source(video, folder_rate)
+    size = small_size(source.width, source.height)
+    inside = _inside(source, size)
+    rate = float(np.clip(LOOKS / max(source.seconds, 1e-3), *RATES))
+    watch, looks, frozen = _Watch(inside, rate), list[Look](), list[float]()
+    times, changes, positions = list[float](), list[float](), list[int]()  # of every image; looks before each
+    thumb = before = None
+    for seconds, image in quick_images(source):
+        now = standardized(image(THUMB_WIDTH, max(round(THUMB_WIDTH * size[1] / size[0]), 1), is_gray=True))
+        times.append(seconds)
+        changes.append(0.0 if thumb is None else change(thumb, now))
+        positions.append(len(looks))
+        thumb = now
+        if looks and seconds < looks[-1].seconds + 1 / rate - 1e-6:
+            continue
+        small = image(*size)
+        frozen.append(np.inf if before is None else float(cv2.absdiff(small, before).mean()))
+        before = small
+        link = watch.link(np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8))
+        looks.append(Look(seconds, measure_quality(small, inside), link))
+        progress(seconds, source.seconds)
+    sudden = np.zeros(len(looks) + 1, bool)
+    first_after = np.full(len(looks) + 1, np.inf)
+    for i in np.flatnonzero(jumps(np.array(times), np.array(changes))):
+        sudden[positions[i]] = True
+        first_after[positions[i]] = min(first_after[positions[i]], times[i])
+    is_cut = breaks(len(looks), watch.pairs) & sudden[: len(looks)]
+    cuts = [float(first_after[i]) for i in np.flatnonzero(is_cut)]
+    duration = max(source.seconds, times[-1] if times else 0.0)
+    return Scan(
+        duration,
+        rate,
+        _judged(looks, is_cut, connected(len(looks), watch.pairs), np.array(frozen) < FROZEN, rate),
+        cuts,
+    )
+
+
+def _judged(
+    looks: list[Look], is_cut: NDArray[np.bool_], place: NDArray[np.integer], same: NDArray[np.bool_], rate: float
+) -> list[Look]:
+    """The looks with what is wrong with each.
+
+    Args:
+        place: a number for each set of looks at the same tissue. same: whether a look repeats the one before.
+    """
+    seconds, measured = np.array([look.seconds for look in looks]), [look.quality for look in looks]
+    scene = np.cumsum(is_cut, dtype=np.int64)
+    words, weights = disturbances(seconds, measured, scene)
+    outside = scenes_outside(measured, place)
+    for i in range(len(looks)):
+        if place[i] in outside:
+            words[i], weights[i] = OUTSIDE, 0.0
+    for first, end in runs(np.array(words) == ""):  # a clear image between two of the same smoke is in it
+        lasts = seconds[min(end, len(looks) - 1)] - seconds[first]
+        if 0 < first and end < len(looks) and lasts < GAP_S and scene[first - 1] == scene[end]:
+            words[first:end] = [words[first - 1]] * (end - first)
+    for first, end in runs(same):
+        if seconds[end - 1] - seconds[first] >= FROZEN_S - 1 / rate:
+            words[first:end] = [word or FROZEN_WORDS for word in words[first:end]]
+    return [
+        Look(look.seconds, look.quality, look.link, word, float(weight))
+        for look, word, weight in zip(looks, words, weights, strict=True)
+    ]
+
+
+def _inside(source: Source, size: tuple[int, int]) -> NDArray[np.bool_]:
+    images = source.glimpses(0.0, source.seconds, GLIMPSES)
+    return view_mask([np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8) for each in images])
+
+
+class _Watch:
+    """Finds the tissue of each image in the images before."""
+
+    def __init__(self, inside: NDArray[np.bool_], rate: float) -> None:
+        self.pairs: list[tuple[int, int]] = []  # positions of images that show the same tissue
+        self._inside, self._count = inside, 0
+        self._views = deque[View](maxlen=max(int(BACK_S * rate), 1))
+
+    def link(self, gray: NDArray[np.uint8]) -> Link | None:
+        """How the tissue moved since an earlier image."""
+        now, found = View(gray, self._inside), None
+        for back in (each for each in BACK if each <= len(self._views)):
+            before = self._views[-back]
+            found = (flow_link(before, now) if back == 1 else None) or feature_link(before, now)
+            if found is not None:
+                self.pairs.append((self._count - back, self._count))
+                break
+        self._views.append(now)
+        self._count += 1
+        return found

@@ -1,0 +1,155 @@
+"""Which stretches of a scanned video one model can show, how good each is, and what is wrong between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import groupby, pairwise
+from typing import Any
+
+import numpy as np
+
+from ..footage.components import runs
+from .scan import Look, Scan
+
+SHORTEST_S = 1.0  # a segment is at least so long, s
+TOLERATED_S = 0.5  # a disturbance that is shorter does not end a segment, s
+LONGEST_S = 30.0  # most of a segment that counts, and that is used unless it is the whole video, s
+UNKNOWN_MOTION = 0.5  # how far an image counts whose motion is unknown
+CUT, SHORT = "scene change", "too short"
+WORDS: tuple[str, ...] = ("smoke", "blur", "dark", "overexposed", "out of the body", "repeated frames", CUT, SHORT)
+"""What keeps a stretch from being a segment."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A part of a video that is a segment, or not."""
+
+    start: float  # time of its first image, s
+    end: float  # s, not included
+    reason: str = ""  # one of `WORDS`; empty for a segment
+    score: float = 0.0  # of a segment: seconds of its best `LONGEST_S`, less where they are disturbed
+    best: tuple[float, float] = (0.0, 0.0)
+    """Start and end of that part, s."""
+
+    @property
+    def seconds(self) -> float:
+        """Its length, s."""
+        return self.end - self.start
+
+
+def stretches_of(scan: Scan) -> list[Stretch]:
+    """The whole video in stretches, in order."""
+    looks = scan.looks
+    if not looks:
+        return []
+    edges = [0.0, *scan.cuts, scan.seconds]
+    times = np.array([look.seconds for look in looks])
+    found = list[Stretch]()
+    for start, end in pairwise(edges):
+        first, last = np.searchsorted(times, [start - 1e-6, end - 1e-6])
+        found += _of_scene(looks[first:last], start, end)
+    return found
+
+
+def segments_of(stretches: list[Stretch]) -> list[Stretch]:
+    """Those of which a model is possible, in order."""
+    return [each for each in stretches if not each.reason]
+
+
+def best_segment(segments: list[Stretch]) -> int:
+    """Position of the one with the best score, the first of equals."""
+    return max(range(len(segments)), key=lambda i: (round(segments[i].score, 2), -i))
+
+
+def _of_scene(looks: list[Look], start: float, end: float) -> list[Stretch]:
+    """The stretches between two cuts."""
+    if not looks:
+        return [Stretch(start, end, SHORT)]
+    words = [look.word for look in looks]
+    edges = [start, *(look.seconds for look in looks[1:]), end]  # look i stands for the time from edge i to edge i + 1
+    disturbed = np.array([bool(word) for word in words])
+    for first, last in runs(disturbed):
+        if edges[last] - edges[first] < TOLERATED_S and 0 < first and last < len(looks):
+            disturbed[first:last] = False
+    found = list[Stretch]()
+    for is_bad, first, last in sorted(
+        [(True, *run) for run in runs(disturbed)] + [(False, *run) for run in runs(~disturbed)], key=lambda run: run[1]
+    ):
+        start, end = edges[first], edges[last]
+        if is_bad:
+            found += _not_usable(words[first:last], edges[first : last + 1])
+        elif end - start < SHORTEST_S:
+            found.append(Stretch(start, end, SHORT))
+        else:
+            found.append(_segment(looks[first:last], edges[first : last + 1]))
+    return found
+
+
+def _not_usable(words: list[str], edges: list[float]) -> list[Stretch]:
+    """A disturbed stretch, cut where another disturbance takes over for longer than `TOLERATED_S`."""
+    found = list[Stretch]()
+    for word, group in groupby(range(len(words)), lambda i: words[i]):
+        places = list(group)
+        start, end = edges[places[0]], edges[places[-1] + 1]
+        if found and (word in ("", found[-1].reason) or end - start < TOLERATED_S):
+            found[-1] = replace(found[-1], end=end)
+        else:
+            found.append(Stretch(start, end, word or words[places[-1] + 1]))
+    return found
+
+
+def _segment(looks: list[Look], edges: list[float]) -> Stretch:
+    """A segment with its score and its best part."""
+    lasts = np.diff(edges)
+    known = np.array([look.link is not None for look in looks])
+    known[:1] = True  # the first image follows nothing
+    worth = np.concatenate(
+        [[0.0], np.cumsum(lasts * [look.weight for look in looks] * np.where(known, 1, UNKNOWN_MOTION))]
+    )
+    ends = np.searchsorted(edges, np.array(edges) + LONGEST_S + 1e-6, side="right") - 1
+    scores = worth[ends] - worth
+    first = int(np.argmax(np.round(scores, 2)))
+    return Stretch(edges[0], edges[-1], "", float(scores[first]), (edges[first], edges[ends[first]]))
+
+
+def as_json(scan: Scan) -> dict[str, Any]:
+    """What `scan.json` holds."""
+    stretches = stretches_of(scan)
+    segments = segments_of(stretches)
+    return {
+        "format_version": 1,
+        "seconds": round(scan.seconds, 3),
+        "looks_per_second": round(scan.rate, 3),
+        "best_segment": best_segment(segments) + 1 if segments else None,
+        "segments": [
+            {
+                "number": number, "start": round(each.start, 3), "end": round(each.end, 3),
+                "score": round(each.score, 2), "used": [round(time, 3) for time in each.best],
+            }
+            for number, each in enumerate(segments, 1)
+        ],
+        "not_usable": [
+            {"start": round(each.start, 3), "end": round(each.end, 3), "reason": each.reason}
+            for each in stretches
+            if each.reason
+        ],
+        "cuts": [round(time, 3) for time in scan.cuts],
+        "looks": {
+            "seconds": [round(look.seconds, 3) for look in scan.looks],
+            "problem": [look.word for look in scan.looks],
+            "weight": [round(look.weight, 3) for look in scan.looks],
+            "shift": [None if look.link is None else round(look.link.shift, 4) for look in scan.looks],
+            "residual": [None if look.link is None else round(look.link.residual, 5) for look in scan.looks],
+            **{
+                name: [round(look.quality[k], 4) for look in scan.looks]
+                for k, name in enumerate(scan.looks[0].quality._fields if scan.looks else ())
+            },
+        },
+    }  # fmt: skip
+
+
+def from_json(scanned: dict[str, Any]) -> list[Stretch]:
+    """The stretches of a video, in order, from what `as_json` gave."""
+    good = [Stretch(each["start"], each["end"], "", each["score"], tuple(each["used"])) for each in scanned["segments"]]
+    bad = [Stretch(each["start"], each["end"], each["reason"]) for each in scanned["not_usable"]]
+    return sorted(good + bad, key=lambda each: each.start)
