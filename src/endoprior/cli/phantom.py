@@ -24,7 +24,7 @@ class Phantom(Command):
 
     examples = ("DATA", "DATA --frames 16 --width 320 --height 256 --stereo")
     basics = (
-        "--frames --width --height --stereo --seed --instruments --tissue --camera --breathing-mm"
+        "--scene --frames --width --height --stereo --seed --instruments --tissue --camera --breathing-mm"
         " --pull-mm --slide-mm --smooth-share --noise"
     )
 

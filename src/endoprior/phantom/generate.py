@@ -16,6 +16,7 @@ from .config import PhantomConfig
 from .scene import Moment, Scene, build_scene
 from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
 from .texture import smooth_patches
+from .tube import write_tube
 from .views import pixel_hits, render_view, shown_elsewhere, side_eyes, side_view, visible_points
 
 _LOOKS = 12
@@ -74,6 +75,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
     - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, and the density of smoke
       in each frame, 0..1; `truth/tissue` shows the smoke too, the side cameras do not;
+    - of the scene `tube` only tissue, depth, tracks and the camera's poses;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
 
     Args:
@@ -83,6 +85,9 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         InputError: `out` is in use.
     """
     with new_sequence(out, _meta(cfg)) as writer:
+        if cfg.scene == "tube":
+            write_tube(writer, cfg, progress)
+            return
         scene = build_scene(cfg)
         tracked = choose_tracks(scene)
         lens = vignette(cfg.width, cfg.height)
@@ -166,6 +171,7 @@ def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye])
 def _meta(cfg: PhantomConfig) -> SequenceMeta:
     """What `sequence.json` says."""
     kinds = f", instruments {cfg.instruments}, tissue {cfg.tissue}" if cfg.has_kinds else ""
+    kinds += ", scene tube" if cfg.scene == "tube" else ""
     made = f"synthetic (endoprior phantom, seed {cfg.seed}{kinds})"
     return SequenceMeta(
         width=cfg.width,
