@@ -82,7 +82,7 @@ def _around(a: NDArray, s: NDArray, around: float, scale: float, octaves: int, s
     a, s = np.broadcast_arrays(a, s)
     share = (a / around).astype(np.float32)
     first, second = (fractal((a - by) / scale, s / scale, octaves, seed) for by in (0, around))
-    return ((1 - share) * first + share * second) / np.hypot(1 - share, share)
+    return np.asarray(((1 - share) * first + share * second) / np.hypot(1 - share, share), np.float32)
 
 
 def _texture(length: float, around: float, seed: int) -> NDArray[np.float32]:
