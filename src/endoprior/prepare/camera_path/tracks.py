@@ -77,7 +77,7 @@ class CameraPath:
     still: NDArray[np.bool_] | None = None  # (T,) whether the pose is a copy, because the camera rests
     breathes: bool = False  # whether periodic motion of the tissue was told apart from the camera's
     notes: list[str] = field(default_factory=list)  # notes for the user, one line each
-    motion: PathMotion | None = None  # how the camera moves along it; None where nobody asked
+    motion: PathMotion | None = None  # how the camera moves along it; None without one
     shape: DepthShape | None = None  # how the path changes the shape of relative depth, before its scale
     is_unknown: bool = False  # whether the images do not say how the camera moves: one camera for the explained frames
 
@@ -94,7 +94,7 @@ class CameraPath:
 
     @property
     def kind(self) -> str:
-        """How the camera moves, in a word of `kind.Kind`; empty where nobody asked."""
+        """How the camera moves, in a word of `kind.Kind`; empty without one."""
         return "unknown" if self.is_unknown else self.motion.kind if self.motion else ""
 
     def record(self) -> dict[str, Any]:
