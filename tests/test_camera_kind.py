@@ -12,6 +12,7 @@ from endoprior.evaluation.scorers.camera_path import trajectory_errors
 from endoprior.footage.alignment import align, mean_shift
 from endoprior.footage.camera_motion import camera_motion
 from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.prepare.camera_path.features import followed, followed_directly, new_corners, view_of
 from endoprior.prepare.camera_path.kind import path_motion
 from endoprior.prepare.camera_path.sequence_path import path_depth, sequence_path
 from endoprior.prepare.camera_path.tracks import CameraPath, Lens, PoseInput, Tracks
@@ -81,6 +82,25 @@ def test_an_unknown_motion_claims_no_poses(rests):
     assert path is not None and path.kind == "unknown" == path.sources({})["camera motion"]
     assert path.explained.tolist() == [k < rests and rests >= 8 for k in range(len(images))]
     assert "unknown" in notes[0] and ("one camera serves" if rests >= 8 else "no model is possible") in notes[0]
+
+
+def test_what_stays_on_the_lens_is_not_followed_where_corners_are_few():
+    pattern = cv2.GaussianBlur(np.random.default_rng(5).normal(size=SIZE[::-1]), (0, 0), 1.0)  # of sensor or fibers
+    pattern, views = pattern * 4 / pattern.std(), []
+    for shift in (0.0, 6.0):
+        gray = np.clip(128 + 0.15 * (shifted(soft(1, 6.0), (shift, 0))[0] - 128.0) + pattern, 0, 255).astype(np.uint8)
+        seen = PoseInput(color(gray), np.ones(SIZE[::-1], bool), np.full(SIZE[::-1], 70, np.float32))
+        views.append([view_of(seen), view_of(seen, coarse=True)])
+    fine, coarse = zip(*views, strict=True)
+    none = np.zeros((0, 2), np.float32)
+    corners = new_corners(fine[0], none)
+    kept, there = followed(*fine, corners)
+    assert np.mean(np.abs(there - corners[kept]).max(1) < 1) > 0.7
+    corners = new_corners(coarse[0], none)
+    found = followed_directly(*coarse, corners)
+    assert found is not None and len(found[0]) > 200
+    assert np.median(found[1][:, 0] - corners[found[0]][:, 0]) > 3.5  # the pattern still pulls
+    assert np.mean(np.abs(found[1] - corners[found[0]]).max(1) < 1) < 0.02
 
 
 def path_of(step, turn_degrees=0.0):
