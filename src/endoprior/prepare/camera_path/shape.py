@@ -68,10 +68,10 @@ class DepthShape:
 
 
 def fitted_shape(path: CameraPath, follower: Follower, before: DepthShape | None = None) -> DepthShape | None:
-    """The shape that the path's triangulated points give the depth; None if there are too few, or they say little.
+    """The shape that the path's triangulated points give the depth; `before` if there are too few, or they say little.
 
     Args:
-        before: what the depth that was followed has had applied already.
+        before: what the depth that was followed has had applied already; None for nothing.
     """
     tracks, count = follower.tracks, len(path.explained)
     frame = np.repeat(np.arange(count), [len(ids) for ids in tracks.ids])
@@ -80,7 +80,7 @@ def fitted_shape(path: CameraPath, follower: Follower, before: DepthShape | None
     good = path.explained[frame] & tracks.adjusted[ids] & (tracks.weight[ids] > 0.3) & (depths > 0)
     frame, ids, pixels, depths = frame[good], ids[good], pixels[good], depths[good]
     if len(ids) < FEWEST:
-        return None
+        return before
     rays = tracks.points[ids] + np.einsum("nji,nj->ni", follower.poses[frame, :3, :3], follower.poses[frame, :3, 3])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     order = np.lexsort((frame, ids))
@@ -90,7 +90,7 @@ def fitted_shape(path: CameraPath, follower: Follower, before: DepthShape | None
     sure = (np.einsum("nj,nj->n", rays[first], rays[last]) < np.cos(np.deg2rad(PARALLAX_DEGREES))) & (z > 0)
     frame, pixels, depths, z = frame[sure], pixels[sure], depths[sure], z[sure]
     if len(z) < FEWEST:
-        return None
+        return before
     x, y = (_without_means(np.log(values), frame, count) for values in (depths, z))
     slope, clear = _slope(x, y)
     power = slope * (before.power if before else 1.0)
