@@ -75,7 +75,8 @@ def test_poses_are_found_and_the_originals_kept(metric, folder, capsys):
     assert np.allclose(found[:, :, 4], [HEIGHT, WIDTH, MATRIX[0, 0]])
     assert (folder / "poses_bounds_before.npy").read_bytes() == (metric / "poses_bounds.npy").read_bytes()
     facts, before = described(folder), described(metric)
-    assert facts["sources"] == before["sources"] | {"poses": "our own tracks"} and facts["unexplained_frames"] == []
+    assert facts["sources"] == before["sources"] | {"poses": "our own tracks", "camera motion": "translating"}
+    assert facts["unexplained_frames"] == []
     record = json.loads((folder / "camera_path.json").read_text())
     assert record["method"] == "our own tracks" and len(record["translation_std_mm"]) == COUNT
     assert 0 < np.median(record["translation_std_mm"]) < 1

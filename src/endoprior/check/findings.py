@@ -196,6 +196,11 @@ def _border(facts: Facts) -> Iterator[Finding]:
 
 
 def _motion(facts: Facts) -> Iterator[Finding]:
+    if facts.camera_is_fixed and facts.motion.kind == "unknown":
+        what = f"whether the camera moves is unknown, and it is static in the stored poses ({facts.motion.reason})"
+        yield Finding(
+            "camera-unknown", "warning", what, "look at the video; use more frames per second, or a shorter part"
+        )
     if not (facts.motion.moving and facts.camera_is_fixed):
         return
     beyond = np.flatnonzero(facts.motion.path_px > MOVING_FRACTION * facts.camera.width)

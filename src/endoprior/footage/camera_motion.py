@@ -1,15 +1,20 @@
-"""Detect camera motion. Tissue moves locally and returns; a moving camera shifts, rotates or zooms the whole image."""
+"""Detect camera motion. Tissue moves locally and returns; a moving camera shifts, rotates or zooms the whole image.
+
+Static is said only where it was shown: images that nothing links to the others are no evidence of rest.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .alignment import align, mean_shift
 from .components import Image, Mask
 from .optical_flow import follow_both_ways
 
@@ -18,29 +23,92 @@ MAX_CORNERS = 400
 MIN_TRACKS = 24  # With fewer tracked corners, no motion is estimated for a pair of images
 RETURN_PX = 1.0  # Followed to the next image and back, a corner returns within this distance
 MIN_INLIERS = 0.4  # Share of corners that must be inliers; below, camera motion does not explain the pair
+SHOWN = 0.9  # Share of images that must be linked to one another before the camera counts as static
+FEW_CORNERS = 0.3  # Share of the explained steps that only direct alignment explains, above which corners are too few
+Kind = Literal["static", "moving", "unknown"]
+WORDS: dict[Kind, str] = {
+    "static": "the camera is static",
+    "moving": "the camera moves",
+    "unknown": "the motion of the camera is unknown",
+}
 MOVING_FRACTION = 0.06
 """The camera moves if the whole image shifts by more than this share of its width. Breathing shifts it by 3 %."""
 
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """Motion of the image as a whole."""
+    """Motion of the image as a whole, over K images."""
 
     pixels_per_frame: NDArray[np.float64]
     """(K - 1,) mean shift between successive images, px of the given images; NaN where no motion fits."""
     path_px: NDArray[np.float64]
-    """(K,) shift of the whole image from the first one, px; unexplained steps count as 0."""
-    moving: bool  # Whether the camera moves
-    reason: str  # The measurements in one line
+    """(K,) shift of the whole image from the first image of its stretch, px."""
+    stretch: NDArray[np.int64]
+    """(K,) first of the images that an image is linked to by explained steps; one that nothing links has itself."""
+    limit_px: float  # A larger shift moves the camera
+    few_corners: bool  # Whether many of the explained steps need direct alignment
+
+    @property
+    def kind(self) -> Kind:
+        """Static only if nearly all images are linked and none is far."""
+        if self.path_px.max() > self.limit_px:
+            return "moving"
+        return "static" if np.bincount(self.stretch).max() >= SHOWN * len(self.stretch) else "unknown"
+
+    @property
+    def moving(self) -> bool:
+        """Whether the camera was seen to move."""
+        return self.kind == "moving"
+
+    @property
+    def resting(self) -> NDArray[np.bool_]:
+        """(K,) True on the most images of one stretch, from its first, that one camera serves."""
+        best = np.zeros(len(self.stretch), bool)
+        for first in np.unique(self.stretch):
+            linked = self.stretch == first
+            near = linked & (np.maximum.accumulate(np.where(linked, self.path_px, 0)) <= self.limit_px)
+            best = near if near.sum() > best.sum() else best
+        return best
+
+    @property
+    def reason(self) -> str:
+        """The measurements in one line."""
+        known, count = np.isfinite(self.pixels_per_frame), np.bincount(self.stretch).max()
+        start = "the first frame" if count == len(self.stretch) else f"the first of up to {count} frames in a row"
+        usual = np.median(self.pixels_per_frame[known]) if known.any() else 0
+        return (
+            f"the whole image shifts by up to {self.path_px.max():.0f} px from {start} "
+            f"({usual:.1f} px a step; {known.mean() if len(known) else 1.0:.0%} of steps explained)"
+        )
+
+    @property
+    def text(self) -> str:
+        """What is known, and why, in one line."""
+        return f"{WORDS[self.kind]}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """An image that later ones are compared with."""
+
+    gray: Image
+    allowed: Image | None
+    first: int  # of its stretch
+    chain: NDArray  # (3, 3) transform from that one
 
 
 def camera_motion(images: Iterable[Image], tissue_masks: Iterable[Mask] | None = None) -> CameraMotion:
-    """Track corners between successive images, and chain the similarity transforms fitted by RANSAC. Of the K images
-    (H, W, 3) only two are in memory at a time. Corners are allowed where the masks (H, W) are True; None allows all.
+    """Chain similarity transforms between successive images: of tracked corners by RANSAC, else of direct alignment.
+
+    An image that nothing links is stepped over. Of the K images (H, W, 3) only three are in memory at a time. Tissue is
+    where the masks (H, W) are True; None allows all.
     """
-    shifts, path = [], [0.0]
-    chain, before, size, factor = np.eye(3), None, (1, 1), 1.0
-    for image, mask in zip(images, repeat(None) if tissue_masks is None else tissue_masks, strict=False):
+    shifts, path, stretch, direct = list[float](), list[float](), list[int](), 0
+    before: _Seen | None = None
+    anchor: _Seen | None = None
+    size, factor = (1, 1), 1.0
+    masks = repeat(None) if tissue_masks is None else tissue_masks
+    for index, (image, mask) in enumerate(zip(images, masks, strict=False)):
         factor = min(1.0, WORK_WIDTH / image.shape[1])
         fy = max(factor, 1 / image.shape[0])  # a strip keeps its one row
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -49,38 +117,40 @@ def camera_motion(images: Iterable[Image], tissue_masks: Iterable[Mask] | None =
         if mask is not None:
             allowed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
             allowed = np.asarray(cv2.erode(allowed, np.ones((5, 5))), np.uint8)
+        now = _Seen(gray, allowed, index, np.eye(3))
         if before is not None:
-            step = _step(*before, gray)
-            shifts.append(np.nan if step is None else _mean_shift(step, *size) / factor)
-            chain = chain if step is None else step @ chain
-            path.append(_mean_shift(chain, *size) / factor)
-        before = (gray, allowed)
-    steps, distances = np.array(shifts), np.array(path)
-    farthest, known = distances.max(), np.isfinite(steps)
-    reason = (
-        f"the whole image shifts by up to {farthest:.0f} px from the first frame "
-        f"({np.median(steps[known]) if known.any() else 0:.1f} px a step; "
-        f"{known.mean() if len(steps) else 1.0:.0%} of steps explained)"
-    )
-    return CameraMotion(steps, distances, bool(farthest > MOVING_FRACTION * size[0] / factor), reason)
+            step = _step(before, now)
+            if step is None and (step := _aligned(before, now)) is not None:
+                direct += 1
+            shifts.append(np.nan if step is None else mean_shift(step, *size) / factor)
+            if step is not None:
+                now = replace(now, first=before.first, chain=step @ before.chain)
+            elif anchor is not None and anchor is not before and (step := _aligned(anchor, now)) is not None:
+                now = replace(now, first=anchor.first, chain=step @ anchor.chain)
+        if before is None or now.first != index:  # a single image that nothing links is no anchor
+            anchor = now
+        path.append(mean_shift(now.chain, *size) / factor)
+        stretch.append(now.first)
+        before = now
+    steps = np.array(shifts)
+    few = direct > FEW_CORNERS * max(int(np.isfinite(steps).sum()), 1)
+    limit = MOVING_FRACTION * size[0] / factor
+    return CameraMotion(steps, np.array(path), np.array(stretch), limit, few)
 
 
-def _step(before: Image, allowed: Image | None, now: Image) -> NDArray | None:
-    """(3, 3) similarity transform between two small gray images; None if too few corners are inliers."""
-    found = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 5, mask=allowed)
+def _aligned(before: _Seen, now: _Seen) -> NDArray | None:
+    return align(before.gray, now.gray, before.allowed, now.allowed)
+
+
+def _step(before: _Seen, now: _Seen) -> NDArray | None:
+    """(3, 3) similarity transform between the corners of two small images; None if too few of them are inliers."""
+    found = cv2.goodFeaturesToTrack(before.gray, MAX_CORNERS, 0.01, 5, mask=before.allowed)
     if found is None or len(found) < MIN_TRACKS:
         return None
     corners = np.asarray(found[:, 0], np.float32)
-    there, good = follow_both_ways(before, now, corners, RETURN_PX, side_px=15)
+    there, good = follow_both_ways(before.gray, now.gray, corners, RETURN_PX, side_px=15)
     if good.sum() < MIN_TRACKS:
         return None
     cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator
     matrix, inliers = cv2.estimateAffinePartial2D(corners[good], there[good], ransacReprojThreshold=1.5)
     return None if matrix is None or inliers.mean() < MIN_INLIERS else np.vstack([matrix, [0, 0, 1]])
-
-
-def _mean_shift(matrix: NDArray, width: int, height: int) -> float:
-    """Mean shift by a (3, 3) transform of 9 points spread over the image, px; also a zoom moves most of them."""
-    x, y = np.meshgrid(np.array([1, 3, 5]) * width / 6, np.array([1, 3, 5]) * height / 6)
-    grid = np.stack([x.ravel(), y.ravel()], 1)
-    return float(np.hypot(*(grid @ matrix[:2, :2].T + matrix[:2, 2] - grid).T).mean())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
 from ..core.checks import input_error
@@ -37,6 +37,8 @@ def _require(name: str, value: float, low: float, high: float) -> None:
 class PhantomConfig:
     """A synthetic operation: breathing bowel under a liver edge, a grasper that pulls it, a second moving tool."""
 
+    scene: Literal["cavity", "tube"] = "cavity"
+    """`tube`: instead, the camera drives forward through a bent tube with folds, as a colon, without tools."""
     frames: int = 48
     """Number of frames, 2..10000. The tool grasps, pulls and releases about once every 48 frames."""
     width: int = 640
@@ -115,6 +117,8 @@ class PhantomConfig:
             if getattr(self, name) not in known:
                 raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
         parse_events(self.events, self.frames)
+        if self.scene == "tube":
+            self._require_no_cavity()
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
         if self.width * self.height * share > MOST_PIXELS:
@@ -130,6 +134,15 @@ class PhantomConfig:
         # With a principal point far off center, the image would extend beyond the modeled tissue.
         _require("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)
         _require("principal_y", self.center[1], 0.35 * self.height, 0.65 * self.height)
+
+    def _require_no_cavity(self) -> None:
+        """Raise InputError if an option is set that belongs to the other scene."""
+        kept = ("scene", "frames", "width", "height", "seed", "baseline_mm", "focal_per_width", "principal_x")
+        kept += ("principal_y", "frames_per_second", "noise", "depth_noise_px", "tracks")
+        for field in fields(self):
+            if field.name not in kept and getattr(self, field.name) != field.default:
+                option = "--" + field.name.replace("_", "-")
+                raise input_error("--scene tube", f"no {option}, which belongs to `cavity`", "one", f"Remove {option}.")
 
     @property
     def has_regions(self) -> bool:

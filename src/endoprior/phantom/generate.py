@@ -19,6 +19,7 @@ from .scene import Moment, Scene, build_scene
 from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth, vignette
 from .surround import border, overlay, surrounded
 from .texture import smooth_patches
+from .tube import write_tube
 from .views import pixel_hits, render_view, shown_elsewhere, side_eyes, side_view, visible_points
 
 _LOOKS = 12
@@ -82,6 +83,7 @@ def write_phantom(
       first frame and shows the smoke of `cfg.tissue`, not that of `cfg.smoke`; the side cameras see none;
     - with `cfg.border` `truth/border.npy`, (H, W) bool, True outside; with `cfg.overlay` `truth/overlay/*.npy`, True
       on the drawing;
+    - of the scene `tube` only tissue, depth, tracks and the camera's poses;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
 
     Args:
@@ -91,6 +93,9 @@ def write_phantom(
         InputError: `out` is in use.
     """
     with new_sequence(out, _meta(cfg)) as writer:
+        if cfg.scene == "tube":
+            write_tube(writer, cfg, progress)
+            return
         scene = build_scene(cfg)
         tracked = choose_tracks(scene)
         lens, outside = vignette(cfg.width, cfg.height), border(cfg)
@@ -217,6 +222,7 @@ def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye],
 def _meta(cfg: PhantomConfig) -> SequenceMeta:
     """What `sequence.json` says."""
     kinds = f", instruments {cfg.instruments}, tissue {cfg.tissue}" if cfg.has_kinds else ""
+    kinds += ", scene tube" if cfg.scene == "tube" else ""
     made = f"synthetic (endoprior phantom, seed {cfg.seed}{kinds})"
     return SequenceMeta(
         width=cfg.width,

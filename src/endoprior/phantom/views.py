@@ -59,8 +59,8 @@ def render_view(scene: Scene, now: Moment, eye: Eye) -> RenderedView:
             tissue = scene.smoke.veiled(tissue, z, now.phase, eye, focal, center)
         image = scene.smoke.veiled(image, np.minimum(z, depth), now.phase, eye, focal, center)
     nearest = np.minimum.reduce([depth[i::n, j::n] for i in range(n) for j in range(n)])
-    share = _pooled(is_tool.astype(np.float32), scene.cfg)
-    return RenderedView(_pooled(tissue, scene.cfg), _pooled(image, scene.cfg), share, nearest)
+    share = pooled(is_tool.astype(np.float32), scene.cfg)
+    return RenderedView(pooled(tissue, scene.cfg), pooled(image, scene.cfg), share, nearest)
 
 
 def render_tissue(scene: Scene, now: Moment, eye: Eye) -> tuple[NDArray, NDArray[np.float32]]:
@@ -69,15 +69,13 @@ def render_tissue(scene: Scene, now: Moment, eye: Eye) -> tuple[NDArray, NDArray
     Smoke is left out: it is not on the tissue.
     """
     samples, _ = _tissue_samples(scene, now, eye, STILL.center)
-    radiance = _pooled(samples * np.array(scene.look.light, np.float32), scene.cfg)
+    radiance = pooled(samples * np.array(scene.look.light, np.float32), scene.cfg)
     return radiance, pixel_hits(eye.sees(now.vertices), scene.cfg)[..., 2]
 
 
 def _tissue_samples(scene: Scene, now: Moment, eye: Eye, viewer: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
     """(SH, SW, 3) radiance towards `viewer` (3,) and (SH, SW) z of every sample."""
-    cfg, n = scene.cfg, SUPERSAMPLE
-    focal, center = _sample_grid(cfg)
-    hits = rasterize(eye.sees(now.vertices), focal, center, n * cfg.width, n * cfg.height)
+    hits, focal, center = sample_hits(eye.sees(now.vertices), scene.cfg)
     axes = scene.plane.axes[:2] @ now.endoscope.turn
     radiance = shade(hits, now.normals, scene.texture, axes, eye, viewer, focal, center)
     return radiance, np.ascontiguousarray(hits[..., 2])
@@ -88,7 +86,14 @@ def _sample_grid(cfg: PhantomConfig) -> tuple[float, tuple[float, float]]:
     return SUPERSAMPLE * cfg.focal, (SUPERSAMPLE * cfg.center[0], SUPERSAMPLE * cfg.center[1])
 
 
-def _pooled(samples: NDArray, cfg: PhantomConfig) -> NDArray:
+def sample_hits(vertices: NDArray, cfg: PhantomConfig) -> tuple[NDArray[np.float32], float, tuple[float, float]]:
+    """(SH, SW, 3) what `rasterize` finds at the samples of a camera; focal length and principal point, px of these."""
+    focal, center = _sample_grid(cfg)
+    return rasterize(vertices, focal, center, SUPERSAMPLE * cfg.width, SUPERSAMPLE * cfg.height), focal, center
+
+
+def pooled(samples: NDArray, cfg: PhantomConfig) -> NDArray:
+    """(H, W, ...) means over the samples of each pixel."""
     return cv2.resize(samples, (cfg.width, cfg.height), interpolation=cv2.INTER_AREA)
 
 

@@ -19,8 +19,8 @@ from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
 from ..footage.changes import find_changes
 from ..system.atomic import write_json
-from .camera_path.sequence_path import AS_OURS, ASSUMED, PATH_RECORD, Reading, rescaled, sequence_path
-from .camera_path.tracks import REFINED, CameraPath, Lens, PoseInput
+from .camera_path.sequence_path import AS_OURS, ASSUMED, PATH_RECORD, Reading, path_depth, sequence_path
+from .camera_path.tracks import MOTION, REFINED, CameraPath, Lens, PoseInput
 
 STATIC = "static camera"
 
@@ -88,12 +88,13 @@ def write_folder_path(
     unexplained = sorted({*lost, *find_changes(map(color, range(count))).off_color})
     new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
     if relative and path is not None:
-        scaled = zip(depths, path.depth_scale, strict=True)
-        replace_depth(folder, ((file.name, rescaled(decode_image(file, size), float(s))) for file, s in scaled))
+        shaped = enumerate(depths)
+        replace_depth(folder, ((f.name, path_depth(path, i, decode_image(f, size), scale)) for i, f in shaped))
     focal = fx * new.focal_factor
     bounds = np.array([depth_bounds(decode_image(file, size), scale) for file in depths])
     facts = {"width": width, "height": height, "fx": focal, "fy": fy * new.focal_factor, "cx": cx, "cy": cy}
-    origin = sources | {"poses": STATIC} if path is None else path.sources(sources)
+    still = {name: text for name, text in sources.items() if name != MOTION} | {"poses": STATIC}
+    origin = still if path is None else path.sources(sources)
     more = facts | {"sources": origin, "unexplained_frames": unexplained}
     table = pose_table(new.camera_to_world, height, width, focal, bounds)
     kept = replace_poses(folder, table, described | more, ours=sources.get("poses") in ESTIMATED_POSES)

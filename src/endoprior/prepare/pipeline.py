@@ -24,7 +24,7 @@ from ..data.writer import FrameFiles, SequenceMeta
 from ..footage.changes import find_changes
 from .calibration import parse_size
 from .calibration_files import read_calibration
-from .camera_path.sequence_path import ASSUMED, CALIBRATED, PATH_RECORD, Reading, rescaled, sequence_path
+from .camera_path.sequence_path import ASSUMED, CALIBRATED, PATH_RECORD, Reading, path_depth, sequence_path
 from .camera_path.tracks import CameraPath, Lens, PoseInput
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
@@ -210,9 +210,9 @@ def _use_path(files: FrameFiles, path: CameraPath) -> None:
     """Bring relative depth and the focal length to those of the path, and record it."""
     if files.meta.depth_relative:
         delete_plan(files.folder)  # to scale depth twice would be wrong
-        for index, scale in enumerate(path.depth_scale):
+        for index in range(files.count):
             file = files.file("depth", index)
-            save_png(file, rescaled(decode_image(file, None), float(scale)))
+            save_png(file, path_depth(path, index, decode_image(file, None), files.meta.depth_scale))
     fx, fy = files.meta.fx * path.focal_factor, files.meta.fy * path.focal_factor
     files.meta = replace(files.meta, fx=fx, fy=fy, sources=path.sources(files.meta.sources))
     files.write_json(PATH_RECORD, path.record())

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...footage.alignment import align
 from ...footage.optical_flow import follow_both_ways
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
@@ -24,6 +25,12 @@ FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0  # shading is left by a blur of width / 6
 COARSE_HALVINGS, FINE_HALVINGS = 4, 1  # how often images are halved to follow corners: plain images, then flat ones
 FINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
 FINE_PX = 2.0  # the two results differ by less than this
+COARSE_FLAT_WIDTHS, BLUR_WIDTHS = 28, 160
+"""Where corners are few, detail between blurs of width / 160 and width / 28 px is followed: finer patterns of sensor or
+fibers stay where they are while the view moves."""
+GUESS_PX = 10.0  # parallax: a corner is this far from where the image as a whole goes, px of an image 640 px wide
+STUCK_PX, STUCK = 3.0, 0.3
+"""Where the image goes by the first or more, px at 640, a corner that goes less than this share belongs to the lens."""
 RETURN_PX = 1.0  # followed to the next frame and back, a corner returns within this distance
 KEYPOINTS = 600
 RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
@@ -41,11 +48,14 @@ class View:
     depth: NDArray[np.float32]  # (H, W) 0 where missing
 
 
-def view_of(seen: PoseInput) -> View:
-    """Prepare a frame."""
+def view_of(seen: PoseInput, *, coarse: bool = False) -> View:
+    """Prepare a frame. Args: coarse: whether corners are few, so that larger detail is followed."""
     plain = np.asarray(cv2.cvtColor(seen.rgb_u8, cv2.COLOR_RGB2GRAY), np.uint8)
+    if coarse:
+        plain = np.asarray(cv2.GaussianBlur(plain, (0, 0), plain.shape[1] / BLUR_WIDTHS), np.uint8)
     bright = np.log(plain.astype(np.float32) + 8)
-    bright -= cv2.GaussianBlur(bright, (0, 0), max(plain.shape[1] / FLAT_WIDTHS, 2.0))
+    widths = COARSE_FLAT_WIDTHS if coarse else FLAT_WIDTHS
+    bright -= cv2.GaussianBlur(bright, (0, 0), max(plain.shape[1] / widths, 2.0))
     flat = np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8)
     measured = np.isfinite(seen.depth) & (seen.depth > 0)
     return View(plain, flat, usable_tissue(seen), np.where(measured, seen.depth, np.float32(0)))
@@ -100,6 +110,32 @@ def followed(before: View, now: View, pixels: NDArray) -> tuple[NDArray, NDArray
         before.flat, now.flat, pixels, RETURN_PX, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
     )
     good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(now.usable, there) > 0)
+    kept = np.flatnonzero(good)
+    return kept, there[kept]
+
+
+def followed_directly(before: View, now: View, pixels: NDArray) -> tuple[NDArray, NDArray] | None:
+    """As `followed`, each corner from where the image as a whole goes; None if the two images do not say where."""
+    step = align(before.plain, now.plain, before.usable, now.usable)
+    if step is None:
+        return None
+    guess = (pixels @ step[:2, :2].T + step[:2, 2]).astype(np.float32)
+    if not len(pixels):
+        return np.zeros(0, np.intp), pixels
+    there, good = follow_both_ways(
+        before.flat,
+        now.flat,
+        pixels,
+        RETURN_PX,
+        side_px=31,
+        halvings=FINE_HALVINGS,
+        guess=guess,
+        criteria=FINE_CRITERIA,
+    )
+    px = now.flat.shape[1] / 640
+    far, gone = np.linalg.norm(guess - pixels, axis=1), np.linalg.norm(there - pixels, axis=1)
+    stuck = (far > STUCK_PX * px) & (gone < STUCK * far)
+    good &= ~stuck & (np.linalg.norm(there - guess, axis=1) < GUESS_PX * px) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
     return kept, there[kept]
 

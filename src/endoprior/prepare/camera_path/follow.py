@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.ranges import spread
 from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
-from .features import Keyframe, Link, View, followed, keyframe, link, new_corners, sampled, view_of
+from .features import Keyframe, Link, View, followed, followed_directly, keyframe, link, new_corners, sampled, view_of
 from .tracks import Lens, PoseInput, Tracks
 
 MIN_TRACKS = 30  # with fewer tracks a frame gets no pose from the frame before
@@ -29,9 +29,9 @@ RECENT, OLDER = 6, 14  # keyframes that a lost frame is compared with: the last 
 class Follower:
     """What is known about the path so far."""
 
-    def __init__(self, lens: Lens, count: int) -> None:
-        """Args: lens: the camera. count: frames of the clip."""
-        self.lens, self.tracks = lens, Tracks(lens)
+    def __init__(self, lens: Lens, count: int, *, few_corners: bool = False) -> None:
+        """Args: lens: the camera. count: frames of the clip. few_corners: whether images are aligned directly first."""
+        self.few_corners, self.lens, self.tracks = few_corners, lens, Tracks(lens)
         self.poses = np.tile(np.eye(4), (count, 1, 1))  # (T, 4, 4) world-to-camera, in the world of the frame's segment
         self.scales = np.ones(count)
         self.segment = np.full(count, -1)
@@ -42,9 +42,10 @@ class Follower:
 
     def follow(self, index: int, seen: PoseInput) -> None:
         """Add the next frame."""
-        view, before, lost, depths = view_of(seen), self._view, True, np.zeros(0, np.float32)
-        if before is not None:
-            kept, pixels = followed(before, view, self._pixels)
+        view, before, lost = view_of(seen, coarse=self.few_corners), self._view, True
+        depths, follow = np.zeros(0, np.float32), followed_directly if self.few_corners else followed
+        if before is not None and (found := follow(before, view, self._pixels)) is not None:
+            kept, pixels = found
             measured = sampled(view.depth, pixels).astype(np.float32)
             lost = not self._find_pose(index, before, self._ids[kept], self._pixels[kept], pixels, measured)
             if not lost:
@@ -179,10 +180,11 @@ class Follower:
 
 
 def follow_camera(
-    frame: Callable[[int], PoseInput], count: int, lens: Lens, progress: Callable[[int], None] = lambda _done: None
-) -> Follower:
+    frame: Callable[[int], PoseInput], count: int, lens: Lens, progress: Callable[[int], None] = lambda _done: None,
+    *, few_corners: bool = False,
+) -> Follower:  # fmt: skip
     """Follow the camera through frames 0..count-1, each read once, in order."""
-    follower = Follower(lens, count)
+    follower = Follower(lens, count, few_corners=few_corners)
     for index in range(count):
         follower.follow(index, frame(index))
         progress(index + 1)

@@ -41,10 +41,11 @@ def own_path(
     size: tuple[int, int],
     *,
     refine_focal: bool = False,
+    few_corners: bool = False,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> tuple[CameraPath, Follower]:
     """The path, and the tracks it comes from. Each frame is read once, in order. Args: as `choose.find_path`."""
-    follower = follow_camera(frame, count, lens, progress)
+    follower = follow_camera(frame, count, lens, progress, few_corners=few_corners)
     labels, frames = np.unique(follower.segment, return_counts=True)
     explained = follower.segment == labels[np.argmax(frames)]
     keyframes = sorted((k for k in follower.keyframes if explained[k.frame]), key=lambda k: k.frame)

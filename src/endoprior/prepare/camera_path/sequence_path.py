@@ -18,13 +18,15 @@ from ...core.checks import input_error, number_ranges
 from ...core.geometry import Convention, length_unit, to_ours
 from ...core.shell import install_command
 from ...data.writer import FARTHEST_UNIT
-from ...footage.camera_motion import camera_motion
+from ...footage.camera_motion import SHOWN, CameraMotion, camera_motion
 from ...footage.pose_fit import View, measure_poses
 from .adjust import Observations, adjust, back_projected, residuals
 from .colmap import LONGEST, colmap_path, is_installed, with_poses
-from .follow import follow_camera
+from .follow import Follower, follow_camera
+from .kind import path_motion
 from .own import own_path
 from .pose_file import is_model, read_model_poses, read_poses
+from .shape import DepthShape, fitted_shape
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
 
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
@@ -36,6 +38,11 @@ METHODS: dict[str, How] = {"auto": "best", "auto-own": "own", "estimate": "best"
 """Values of --poses that estimate a path; `still` and files do not."""
 ONLY_IF_MOVING = ("auto", "auto-own")  # those that do so only where the camera moves
 WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}  # the same, ten times faster
+FEWEST_POSED = 8  # frames; a shorter path is none
+SHAPINGS = 2
+"""Where the camera drives ahead, triangulated points fix the shape of relative depth, and the camera is followed again
+so often with the better depth."""
+UNKNOWN_POSES = "none: the motion of the camera is unknown"  # `sources.poses`
 Frame = Callable[[int], PoseInput]
 
 
@@ -102,12 +109,45 @@ def sequence_path(
     if how == "still":
         return None, []
     motion = camera_motion(*views())
-    if how in ONLY_IF_MOVING and not motion.moving:
-        return None, [f"the camera is static: {motion.reason}"]
+    if how in ONLY_IF_MOVING and motion.kind == "static":
+        return None, [motion.text]
     if not has_depth:
-        return None, [f"the camera moves: {motion.reason}; without depth its path cannot be estimated"]
-    path = find_path(frame, count, lens, size, METHODS[how], refine_focal=refine_focal, progress=progress)
+        return None, [f"{motion.text}; without depth its path cannot be estimated"]
+    path = find_path(
+        frame, count, lens, size, METHODS[how],
+        refine_focal=refine_focal, few_corners=motion.few_corners, progress=progress,
+    )  # fmt: skip
+    if how in ONLY_IF_MOVING and (why := _doubt(path, motion)):
+        return _unknown_path(motion, why)
     return path, [*_estimate_notes(motion.reason, path, lens), *path.notes]
+
+
+def _doubt(path: CameraPath, motion: CameraMotion) -> str:
+    """Why the path is no answer; empty if it is one."""
+    posed = int(path.explained.sum())
+    if posed < max(FEWEST_POSED, min(motion.resting.sum(), len(path.explained))):
+        return f"only {posed} of {len(path.explained)} frames can be linked by poses"
+    if path.kind == "static" and posed < SHOWN * len(path.explained):
+        return f"the path rests, but only {posed} of {len(path.explained)} frames are on it"
+    if path.motion is not None and path.motion.contradicts(motion.pixels_per_frame):
+        return "the estimated path moves otherwise than the images"
+    return ""
+
+
+def _unknown_path(motion: CameraMotion, why: str) -> tuple[CameraPath, list[str]]:
+    """One camera for the longest stretch in which the view rests; all other frames are unexplained."""
+    rests, count = motion.resting, len(motion.stretch)
+    if rests.sum() < FEWEST_POSED:
+        rests = np.zeros(count, bool)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    path = CameraPath(poses, rests, np.ones(count), UNKNOWN_POSES, is_unknown=True)
+    frames = number_ranges(np.flatnonzero(rests).tolist())
+    end = f"in frames {frames} the view rests, and one camera serves them" if rests.any() else "no model is possible"
+    moved = "how the camera moves is unknown" if motion.moving else "the motion of the camera is unknown"
+    return path, [
+        f"{moved}: {motion.reason}; {why}. No poses are claimed: {end}. More frames per second, or another part of "
+        "the video, may say more"
+    ]
 
 
 def _given_path(
@@ -141,6 +181,7 @@ def find_path(
     how: How = "best",
     *,
     refine_focal: bool = False,
+    few_corners: bool = False,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> CameraPath:
     """Estimate the camera path.
@@ -156,10 +197,28 @@ def find_path(
     """
     if how == "colmap" and not is_installed():
         raise input_error("--poses colmap", "the package pycolmap", "none", f"`{install_command('poses')}`.")
-    own, follower = own_path(frame, count, lens, size, refine_focal=refine_focal, progress=progress)
+
+    def followed(shape: DepthShape | None = None) -> tuple[CameraPath, Follower]:
+        def shaped(index: int) -> PoseInput:
+            seen = frame(index)
+            return seen if shape is None else replace(seen, depth=shape.powered(seen.depth))
+
+        return own_path(
+            shaped, count, lens, size, refine_focal=refine_focal, few_corners=few_corners, progress=progress
+        )
+
+    own, follower = followed()
+    own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
+    if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.drives:
+        shape = fitted_shape(own, follower)
+        for _ in range(SHAPINGS if shape else 0):
+            own, follower = followed(shape)
+            own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
+            shape = fitted_shape(own, follower, shape)
+        own = replace(own, shape=shape)
     if how == "own" or not is_installed():
         return own
-    if how == "best" and (own.breathes or count > LONGEST):  # COLMAP would give breathing to the camera
+    if how == "best" and (own.breathes or own.shape or count > LONGEST):  # COLMAP would give breathing to the camera
         return own
     other = colmap_path(frame, count, follower, refine_focal=refine_focal)
     if other is None:
@@ -167,6 +226,7 @@ def find_path(
             raise input_error("--poses colmap", "images that COLMAP can register", "too few", "Use `--poses own`.")
         return replace(own, notes=[*own.notes, "COLMAP registers too few frames; the path is our own"])
     other = replace(other, focal_factor=own.focal_factor * other.focal_factor)
+    other = replace(other, motion=path_motion(other, follower.tracks, lens.with_focal(other.focal_factor), size))
     mine, theirs = (explained_share(follower.tracks, lens, path) for path in (own, other))
     best = other if how == "colmap" or theirs > mine else own
     note = f"camera path by {best.method}: COLMAP explains {theirs:.1%} of the held-out tracks, our own path {mine:.1%}"
@@ -213,6 +273,13 @@ def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
     return float((total[rated] / np.maximum(count[rated], 1)).mean()) if rated.any() else 0.0
 
 
+def path_depth(path: CameraPath, index: int, stored: NDArray, unit_mm: float) -> NDArray[np.uint16]:
+    """Stored relative depth (H, W) of a frame in the shape and the scale of the path."""
+    if path.shape is not None:
+        stored = path.shape.shaped(index, stored.astype(np.float32) * unit_mm) / unit_mm
+    return rescaled(stored, float(path.depth_scale[index]))
+
+
 def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
     """Stored depth times a factor; 0, missing, stays, and what is too far for 16 bits becomes it."""
     units = np.round(stored.astype(np.float64) * scale)
@@ -242,7 +309,13 @@ def _estimate_notes(reason: str, path: CameraPath, lens: Lens) -> list[str]:
     """How far the path reaches and how sure it is, where the camera rests, and the focal length if it was refined."""
     unit, centers = length_unit(lens.depth_is_relative), path.camera_to_world[:, :3, 3]
     reach = np.linalg.norm(centers - centers[0], axis=1).max()
-    notes = [f"the camera moves: {reason}; the estimated path reaches {reach:.0f} {unit} from its start"]
+    moves = "the camera hardly moves" if path.kind == "static" else "the camera moves"
+    how = f"; by the path, its shift is {path.motion.reason}" if path.motion and len(path.motion.parts_px) else ""
+    notes = [f"{moves}: {reason}{how}; the estimated path reaches {reach:.0f} {unit} from its start"]
+    if path.shape is not None:
+        notes.append(
+            f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, and triangulated points"
+        )
     if path.translation_std is not None and path.rotation_std is not None and np.isfinite(path.translation_std).any():
         moved, turned = np.nanmedian(path.translation_std), np.nanmedian(path.rotation_std)
         stds = f"{moved:.2f} {unit}, {turned:.3f} degrees"

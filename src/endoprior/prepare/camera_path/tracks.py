@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .adjust import Observations, Resected, refined_pose
 
+if TYPE_CHECKING:
+    from .kind import PathMotion
+    from .shape import DepthShape
+
 REFINED = "refined with the camera path"  # where the focal length may come from: `sources.lens` of `sequence.json`
+MOTION = "camera motion"  # of `sources`: how the camera moves, or `unknown`
 HELD_OUT = 8  # one in this many tracks takes no part in any estimate: it measures how well a path explains the frames
 PIXEL_STD = 0.5  # error of a followed corner, px of an image 640 px wide
 KEYPOINT_STD = 1.0  # error of a matched keypoint, px of an image 640 px wide
@@ -72,6 +77,9 @@ class CameraPath:
     still: NDArray[np.bool_] | None = None  # (T,) whether the pose is a copy, because the camera rests
     breathes: bool = False  # whether periodic motion of the tissue was told apart from the camera's
     notes: list[str] = field(default_factory=list)  # notes for the user, one line each
+    motion: PathMotion | None = None  # how the camera moves along it; None without one
+    shape: DepthShape | None = None  # how the path changes the shape of relative depth, before its scale
+    is_unknown: bool = False  # whether the images do not say how the camera moves: one camera for the explained frames
 
     @property
     def lost(self) -> list[int]:
@@ -80,7 +88,14 @@ class CameraPath:
 
     def sources(self, old: dict[str, str]) -> dict[str, str]:
         """`sources` of `sequence.json` with those of this path."""
-        return old | {"poses": self.method} | ({"lens": REFINED} if self.focal_factor != 1 else {})
+        kept = {name: text for name, text in old.items() if name != MOTION}
+        motion = {MOTION: self.kind} if self.kind else {}
+        return kept | {"poses": self.method} | motion | ({"lens": REFINED} if self.focal_factor != 1 else {})
+
+    @property
+    def kind(self) -> str:
+        """How the camera moves, in a word of `kind.Kind`; empty without one."""
+        return "unknown" if self.is_unknown else self.motion.kind if self.motion else ""
 
     def record(self) -> dict[str, Any]:
         """What `camera_path.json` holds."""
@@ -91,6 +106,7 @@ class CameraPath:
 
         return {
             "method": self.method,
+            "camera_motion": self.kind,
             "focal_factor": round(self.focal_factor, 5),
             "explained": self.explained.tolist(),
             "still": [] if self.still is None else self.still.tolist(),

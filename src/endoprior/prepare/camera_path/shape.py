@@ -1,0 +1,119 @@
+"""The shape of relative depth, fixed by points that the camera's way triangulates.
+
+Depth from shading knows which tissue is far, not how far: brightness falls with the square of the distance to the lamp
+and with the cosine of the slope, and how much of either counts differs between a wall ahead and a tube. Where the
+camera drives ahead, triangulated points say it: a power of the depth for the whole clip, log z = power * log d +
+constant, and what is left at the points of each frame, spread over pixels of like depth around them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .follow import Follower
+from .tracks import CameraPath
+
+PARALLAX_DEGREES = 2.0  # rays to a point differ by this, or its depth is that of the shading
+FEWEST = 200  # observations of such points
+LEAST_POWER, MOST_POWER = 1.15, 6.0
+CLEAR = 0.3  # share of the variance of log depth that the power explains
+REACHES, LIKE = (1 / 8, 1 / 18, 1 / 36), 0.1
+"""A point speaks for pixels within this distance, as a share of the width, and of this difference of log depth. What is
+left at the points after one reach is spread over the next (successive corrections)."""
+DOUBT = 0.05  # weight of no change beside that of one point at its place
+SMALL_WIDTH = 160  # the change is computed at this width, px
+
+
+@dataclass(frozen=True)
+class DepthShape:
+    """How relative depth d becomes z: `middle` (d / middle)^power, and a change for each frame."""
+
+    power: float
+    middle: float
+    pixels: list[NDArray]  # (N, 2) px of the points of each frame ...
+    change: list[NDArray]  # ... and (N,) the logarithm of their z as a multiple of that of the power and the scale
+
+    def powered(self, depth: NDArray) -> NDArray[np.float32]:
+        """Depth with the power alone; 0 stays."""
+        return np.asarray(self.middle * (np.maximum(depth, 0) / self.middle) ** self.power, np.float32)
+
+    def shaped(self, index: int, depth: NDArray) -> NDArray[np.float32]:
+        """(H, W) depth of a frame with the power and its change; 0 stays."""
+        powered = self.powered(depth)
+        at, change = self.pixels[index], self.change[index]
+        if not len(at):
+            return powered
+        height, width = depth.shape
+        size = SMALL_WIDTH, max(round(height * SMALL_WIDTH / width), 1)
+        small = cv2.resize(powered, size, interpolation=cv2.INTER_NEAREST)
+        log, px = np.log(np.maximum(small, 1e-3)), width / SMALL_WIDTH
+        y, x = np.mgrid[: small.shape[0], : small.shape[1]].astype(np.float32) + 0.5
+        spot = np.clip((at / px).astype(int), 0, np.array(small.shape[::-1]) - 1)
+        left, field = change.astype(np.float32), np.zeros_like(log)
+        for reach in REACHES:
+            total, weight = np.zeros_like(log), np.full_like(log, DOUBT)
+            for (u, v), (i, j), value in zip(at / px, spot, left, strict=True):
+                near = ((x - u) ** 2 + (y - v) ** 2) / (reach * SMALL_WIDTH) ** 2 + ((log - log[j, i]) / LIKE) ** 2
+                share = np.exp(-near / 2)
+                total += share * value
+                weight += share
+            step = total / weight
+            field, left = field + step, left - step[spot[:, 1], spot[:, 0]]
+        factor = cv2.resize(np.exp(field), (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(powered * factor, np.float32)
+
+
+def fitted_shape(path: CameraPath, follower: Follower, before: DepthShape | None = None) -> DepthShape | None:
+    """The shape that the path's triangulated points give the depth; `before` if there are too few, or they say little.
+
+    Args:
+        before: what the depth that was followed has had applied already; None for nothing.
+    """
+    tracks, count = follower.tracks, len(path.explained)
+    frame = np.repeat(np.arange(count), [len(ids) for ids in tracks.ids])
+    ids, pixels = np.concatenate(tracks.ids), np.concatenate(tracks.pixels).astype(np.float64)
+    depths = np.concatenate(tracks.depths).astype(np.float64)
+    good = path.explained[frame] & tracks.adjusted[ids] & (tracks.weight[ids] > 0.3) & (depths > 0)
+    frame, ids, pixels, depths = frame[good], ids[good], pixels[good], depths[good]
+    if len(ids) < FEWEST:
+        return before
+    rays = tracks.points[ids] + np.einsum("nji,nj->ni", follower.poses[frame, :3, :3], follower.poses[frame, :3, 3])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    order = np.lexsort((frame, ids))
+    first = order[np.searchsorted(ids[order], ids, "left")]
+    last = order[np.searchsorted(ids[order], ids, "right") - 1]
+    z = np.einsum("nj,nj->n", follower.poses[frame, 2, :3], tracks.points[ids]) + follower.poses[frame, 2, 3]
+    sure = (np.einsum("nj,nj->n", rays[first], rays[last]) < np.cos(np.deg2rad(PARALLAX_DEGREES))) & (z > 0)
+    frame, pixels, depths, z = frame[sure], pixels[sure], depths[sure], z[sure]
+    if len(z) < FEWEST:
+        return before
+    x, y = (_without_means(np.log(values), frame, count) for values in (depths, z))
+    slope, clear = _slope(x, y)
+    power = slope * (before.power if before else 1.0)
+    if not LEAST_POWER < power < MOST_POWER or clear < CLEAR:
+        return before
+    left = y - slope * x
+    at = [np.flatnonzero(frame == f) for f in range(count)]
+    middle = before.middle if before else float(np.exp(np.median(np.log(depths))))
+    return DepthShape(power, middle, [pixels[k] for k in at], [left[k] for k in at])
+
+
+def _without_means(values: NDArray, frame: NDArray, count: int) -> NDArray:
+    """(N,) values less the mean of their frame: each frame has a scale of its own."""
+    total = np.bincount(frame, weights=values, minlength=count) / np.maximum(np.bincount(frame, minlength=count), 1)
+    return values - total[frame]
+
+
+def _slope(x: NDArray, y: NDArray) -> tuple[float, float]:
+    """Slope of y by x through the origin, with robust weights, and the share of variance that it explains."""
+    weight, slope = np.ones_like(x), 1.0
+    for _ in range(10):
+        slope = float((weight * x * y).sum() / max(float((weight * x * x).sum()), 1e-12))
+        error = y - slope * x
+        sigma = 1.4826 * float(np.median(np.abs(error))) + 1e-6
+        weight = (1 / (1 + (error / (3 * sigma)) ** 2)) ** 2
+    return slope, 1 - float((weight * error**2).sum() / max(float((weight * y**2).sum()), 1e-12))
