@@ -30,6 +30,7 @@ from ..footage.components import runs
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
+from ..prepare.camera_path.tracks import MOTION
 from ..prepare.pipeline import Progress
 from ..prepare.scan_figure import draw_scan
 from ..runs.folder import CHECKPOINT, CONFIG
@@ -150,7 +151,9 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
     result = evaluate(scene, sequence, networks=False)
     result.protocol |= mask_facts(job.run)
     missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
-    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative)
+    # Where any frame shows a resting view, only those are used, and one camera is right for them.
+    is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
+    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative, is_unknown)
     result.verdict = verdict_on(result.scores, facts)
     result.save(job.run)
     title = [PREVIEW_TITLE] * job.is_preview + wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)
