@@ -62,6 +62,7 @@ def scored(sequence, split: str) -> Evaluation:
         rgb = sequence.truth.tissue(index) / 255 + error
         rendered[index] = SimpleNamespace(rgb=rgb, depth=sequence.truth.depth(index))
     context = SimpleNamespace(sequence=sequence, frames=sequence.frames(split), rendered=rendered)
+    context.tissue_color = lambda index: rendered[index].rgb
     context.result = Evaluation({})
     for name in ("add", "add_mean", "skip_if_unavailable"):
         setattr(context, name, getattr(EvaluationContext, name).__get__(context))

@@ -24,8 +24,8 @@ class Phantom(Command):
 
     examples = ("DATA", "DATA --frames 16 --width 320 --height 256 --stereo")
     basics = (
-        "--scene --frames --width --height --stereo --seed --instruments --tissue --smoke --gain --camera"
-        " --breathing-mm --pull-mm --slide-mm --smooth-share --noise --events"
+        "--scene --frames --width --height --stereo --seed --instruments --tissue --smoke --gain --camera --noise"
+        " --events"
     )
 
     def execute(self) -> None:
