@@ -43,7 +43,9 @@ RETURN_PX = 1.0  # a point that comes back by less is followed rightly
 REFERENCE_WIDTH_PX = 640
 LEAST_ANGLE = math.radians(1.5)  # rays that meet at a smaller angle do not tell depth
 MOST_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, are not of one resting point
-LEAST_POINTS = 40
+LEAST_POINTS, LEAST_SHARE = 40, 0.1
+"""Least number of points that a score rests on, and their share of all that lie on tissue: a few beside a dark tube do
+not speak for its depth."""
 FEW_POINTS = "too few points could be followed on tissue"
 STANDS = "the camera stands still"
 
@@ -111,9 +113,10 @@ def moved_frame(training: FrameList, frame: Frame) -> tuple[NDArray[np.float32],
 def _point_references(context: EvaluationContext, scene: Scene) -> None:
     sequence = context.sequence
     ahead = min(AHEAD, len(sequence) - 1)
-    slips, errors = list[NDArray](), list[NDArray]()
+    slips, errors, tried = list[NDArray](), list[NDArray](), 0
     for k in spread(len(sequence) - ahead, STARTS):
         followed = follow(sequence, k, ahead)
+        tried += followed.tried
         if not len(followed.start):
             continue
         camera, time = sequence.camera(k), k / len(sequence)
@@ -134,7 +137,8 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
         ("depth_triangulated_error", errors, f"{STANDS}, or {FEW_POINTS}"),
     ):
         found = np.concatenate(values) if values else np.zeros(0)
-        context.add(name, float(np.median(found)) if len(found) >= LEAST_POINTS else math.nan, why)
+        enough = len(found) >= max(LEAST_POINTS, LEAST_SHARE * tried)
+        context.add(name, float(np.median(found)) if enough else math.nan, why)
 
 
 @dataclass(frozen=True)
@@ -143,6 +147,7 @@ class Followed:
 
     start: NDArray[np.float32]  # (P, 2) px
     end: NDArray[np.float32]  # (P, 2) px
+    tried: int  # number of points on tissue that were to be followed
 
 
 def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
@@ -154,13 +159,14 @@ def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
     now = start = (at - HALF).astype(np.float32)
     gray = gray_for_flow(frame.rgb_u8, 1)
     kept = shown_pixels(now + HALF, frame.tissue_mask)
+    tried = int(kept.sum())
     for index in range(first + 1, first + ahead + 1):
         frame = sequence.frame(index)
         following = gray_for_flow(frame.rgb_u8, 1)
         now, returned = follow_both_ways(gray, following, now, RETURN_PX)
         kept &= returned & shown_pixels(now + HALF, frame.tissue_mask)
         gray = following
-    return Followed(start[kept] + HALF, now[kept] + HALF)
+    return Followed(start[kept] + HALF, now[kept] + HALF, tried)
 
 
 def triangulated(
