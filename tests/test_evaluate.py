@@ -118,7 +118,7 @@ def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
     from endoprior import phantom as package
 
     def small(out, cfg, progress=None):
-        write_phantom(out, replace(cfg, width=96, height=80), progress)
+        write_phantom(out, replace(cfg, width=96, height=80), *[progress] * (progress is not None))
 
     quick = preset("default")
     quick = replace(

@@ -202,7 +202,7 @@ def test_prepare_and_check_write_in_a_folder_with_an_umlaut(windows, tmp_path, c
     texture = np.kron(rng.integers(40, 200, (12, 16, 3), np.uint8), np.ones((8, 8, 1), np.uint8))
     video = write_video(tmp_path / "clip.mkv", [texture[i : i + 80, i : i + 96] for i in range(5)])
     out = tmp_path / "Jörg" / "data"
-    cfg = PrepareConfig(layout="mono", border="keep", masks="none", depth="shading", poses="still")
+    cfg = PrepareConfig(border="keep", masks="none", depth="shading", poses="still")
     prepare(video, out, cfg)
     assert np.load(out / "poses_bounds.npy")[0, 15] > 0  # the nearest depth, read from the files
     assert main(["check", str(out), "--out", str(tmp_path / "check.png"), "--json", str(tmp_path / "check.json")]) == 0

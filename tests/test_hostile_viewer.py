@@ -182,7 +182,7 @@ def test_messages_that_no_browser_sends(viewer, good, capfd):
     time.sleep(0.5)
     stranger.socket.close()
     # True and 1 are values that some of them can have.
-    switches = {"measure", "follow", "tool", "erase", "tracks", "correct"}
+    switches = {"measure", "follow", "tool", "erase", "tracks", "correct", "smoke", "find"}
     allowed = switches | {"frame", "since", "clip"}
     now = {name: getattr(viewer.panel, name).value for name in state}
     assert {name for name in state if state[name] != now[name]} <= allowed

@@ -78,8 +78,9 @@ def run(argv: list[str]) -> int:
     from .spec_file import find_spec
     from .timing import estimate
 
+    folders = _checked(args)
     source = find_spec(args.spec)
-    loaded = _chosen(args, source)
+    loaded = _chosen(args, source, folders)
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -114,19 +115,29 @@ def run(argv: list[str]) -> int:
     return 1 if any(matrix.failed for matrix in reports.values()) else 0
 
 
-def _chosen(args: Bench, source: Path) -> dict[Path, Spec]:
-    """The specs to run. Folders that were typed must be there; of published tables those run that they belong to."""
-    from .matrix import open_sequence
-    from .spec import Choice
-    from .spec_file import load_specs, specs_of
-
+def _checked(args: Bench) -> dict[str, Path]:
+    """The folders of `--data` by the name of their sequence; InputError if an option has an impossible value."""
     limits = (("--threads", args.threads, 1, MOST_CORES), ("--cores", args.cores, 0, MOST_CORES))
     for option, value, least, most in (*limits, ("--iterations", args.iterations, 0, MOST_ITERATIONS)):
         if not least <= value <= most:
             raise input_error(option, f"{least} to {most}", f"{value}", "choose a value in this range.")
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
-    folders = _folders(args.data)
+    folders = {}
+    for item in args.data:
+        name, separator, folder = item.partition("=")
+        if not separator or not folder:
+            raise input_error("--data", "NAME=FOLDER", f"{item!r}", "Name a sequence of the spec.")
+        folders[name] = Path(folder).expanduser()
+    return folders
+
+
+def _chosen(args: Bench, source: Path, folders: dict[str, Path]) -> dict[Path, Spec]:
+    """The specs to run. Folders that were typed must be there; of published tables those run that they belong to."""
+    from .matrix import open_sequence
+    from .spec import Choice
+    from .spec_file import load_specs, specs_of
+
     loaded = load_specs(specs_of(source), folders, Choice(args.methods, args.seeds, args.iterations))
     typed = {path: folders.keys() & spec.sequences.keys() for path, spec in loaded.items()}
     for path, names in typed.items():
@@ -138,13 +149,3 @@ def _chosen(args: Bench, source: Path) -> dict[Path, Spec]:
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _folders(data: tuple[str, ...]) -> dict[str, Path]:
-    folders = {}
-    for item in data:
-        name, separator, folder = item.partition("=")
-        if not separator or not folder:
-            raise input_error("--data", "NAME=FOLDER", f"{item!r}", "Name a sequence of the spec.")
-        folders[name] = Path(folder).expanduser()
-    return folders

@@ -13,7 +13,7 @@ from .calibration import Calibration
 from .config import Layout
 
 KINDS: tuple[Layout, ...] = ("side-by-side", "top-bottom", "interlaced")  # how one frame can hold two images
-LOOK_ALIKE, BY_CHANCE = 0.55, 0.15
+LOOK_ALIKE, BY_CHANCE = 0.55, 0.3
 """Correlation of the details of both halves of a frame above which they are two views of one scene, and by how much it
 exceeds that with one half upside down. Shading does not count: halves of a tube or of a round image are alike.
 """

@@ -137,7 +137,7 @@ def _doubt(path: CameraPath, motion: CameraMotion) -> str:
 def _unknown_path(motion: CameraMotion, why: str) -> tuple[CameraPath, list[str]]:
     """One camera for the longest stretch in which the view rests; all other frames are unexplained."""
     rests, count = motion.resting, len(motion.stretch)
-    if rests.sum() < FEWEST_POSED:
+    if rests.sum() < min(FEWEST_POSED, max(2, count / 2)):  # most of a short clip are enough
         rests = np.zeros(count, bool)
     poses = np.tile(np.eye(4), (count, 1, 1))
     path = CameraPath(poses, rests, np.ones(count), UNKNOWN_POSES, is_unknown=True)
