@@ -71,6 +71,7 @@ def test_the_method_of_the_page_is_complete(linear, tiny_sequence, tmp_path):
     assert torch.equal(resumed.gaussians["velocities"], scene.gaussians["velocities"])
 
 
+@pytest.mark.slow
 def test_an_own_loss_on_top_of_default_starts_from_flow_trains_resumes_and_loads(tiny_sequence, tmp_path):
     sequence, losses, moved = load_sequence(tiny_sequence), [], []
     with registered(tmp_path / "site"):
