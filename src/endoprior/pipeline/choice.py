@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -47,12 +48,11 @@ class Choice:
 
     def words(self, video: Path, out: Path, options: Mapping[str, tuple[str, ...]] = MappingProxyType({})) -> list[str]:
         """What is used, why, and the commands for the other segments; nothing if the whole video is one segment."""
-        lost = {each.reason: 0.0 for each in self.stretches if each.reason}
+        lost: defaultdict[str, float] = defaultdict(float)
         for each in self.stretches:
-            lost |= {each.reason: lost[each.reason] + each.seconds} if each.reason else {}
-        bad = ", ".join(
-            f"{reason} {seconds:.1f} s" for reason, seconds in sorted(lost.items(), key=lambda one: -one[1])
-        )
+            if each.reason:
+                lost[each.reason] += each.seconds
+        bad = ", ".join(f"{reason} {lost[reason]:.1f} s" for reason in sorted(lost, key=lambda each: -lost[each]))
         if not self.number:
             return [f"no segment of {video} is clear ({bad}): everything is used"] if bad else []
         (start, end), ranked = self.span, sorted(range(len(self.segments)), key=lambda i: -self.segments[i].score)
