@@ -13,8 +13,8 @@ from endoprior.data import load_sequence
 from endoprior.model.motion import basis_weights
 from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.losses import StartTracks, track_term
 from endoprior.training.ops import NUMBA, TORCH
+from endoprior.training.tracks import StartTracks
 
 BASIS = BasisConfig(num_bases=6)
 CAMERA = Camera(320, 256, 300.0, 300.0, 160.0, 128.0, np.eye(4))
@@ -41,14 +41,14 @@ def random_case(seed: int = 0):
 def test_one_millimeter_at_a_known_depth():
     # 1 mm at 60 mm is 300 / 60 = 5 px of a frame 320 px wide, so 10 px of one 640 px wide.
     offsets = torch.tensor([[1.0, 0.0, 0.0]])
-    term = track_term(at_depth(60.0), offsets, still_tracks(1, [[1.0]]), FRAME, 0, BASIS, NUMBA)
+    term = NUMBA.track_term(at_depth(60.0), offsets, still_tracks(1, [[1.0]]), FRAME, 0, BASIS)
     assert term.item() == pytest.approx(math.sqrt(10**2 + 1) - 1, rel=1e-5)
 
 
 def test_where_the_flow_lost_the_point_or_it_is_behind_the_camera_nothing_counts():
     offsets = torch.ones(2, 3, requires_grad=True)
     tracks = still_tracks(2, [[1.0, 0.0], [1.0, 1.0]])
-    term = track_term(at_depth(60.0, -60.0), offsets, tracks, FRAME, 1, BASIS, NUMBA)
+    term = NUMBA.track_term(at_depth(60.0, -60.0), offsets, tracks, FRAME, 1, BASIS)
     term.backward()
     assert term.item() == 0 and not offsets.grad.any()
 
@@ -62,29 +62,30 @@ def test_agrees_with_a_loop(ops):
         px = 2 * 300 / (means[n, 2] + wanted[2]).item()
         error = px * (offsets[n].detach().double() - wanted).norm().item()
         total += tracks.followed[row, 3].item() * (math.sqrt(error**2 + 1) - 1)
-    term = track_term(means, offsets, tracks, FRAME, 3, BASIS, ops)
+    term = ops.track_term(means, offsets, tracks, FRAME, 3, BASIS)
     assert term.item() == pytest.approx(total / 7, rel=1e-4)
 
 
-def test_gradient_goes_to_the_offsets_and_is_that_of_differences():
+@pytest.mark.parametrize("ops", [NUMBA, TORCH])
+def test_gradient_goes_to_the_offsets_and_is_that_of_differences(ops):
     means, offsets, tracks = random_case(1)
     means.requires_grad_()
-    track_term(means, offsets, tracks, FRAME, 2, BASIS, TORCH).backward()
+    (2 * ops.track_term(means, offsets, tracks, FRAME, 2, BASIS)).backward()
     assert means.grad is None
     for n, axis in ((0, 0), (3, 1), (6, 2)):
         values = []
         for step in (1e-2, -1e-2):
             moved = offsets.detach().clone()
             moved[n, axis] += step
-            values.append(track_term(means, moved, tracks, FRAME, 2, BASIS, TORCH).item())
-        assert offsets.grad[n, axis].item() == pytest.approx((values[0] - values[1]) / 2e-2, rel=2e-2, abs=1e-4)
+            values.append(TORCH.track_term(means, moved, tracks, FRAME, 2, BASIS).item())
+        assert offsets.grad[n, axis].item() == pytest.approx(2 * (values[0] - values[1]) / 2e-2, rel=2e-2, abs=1e-4)
 
 
 def test_a_track_itself_costs_nothing():
     means, _, tracks = random_case(2)
     offsets = NUMBA.model.weighted_sum(tracks.coefficients, basis_weights(FRAME.time, BASIS))[tracks.rows]
     offsets.requires_grad_()
-    term = track_term(means, offsets, tracks, FRAME, 0, BASIS, NUMBA)
+    term = NUMBA.track_term(means, offsets, tracks, FRAME, 0, BASIS)
     term.backward()
     assert term.item() == 0 and not offsets.grad.any()
 

@@ -29,7 +29,7 @@ from ..core.checks import check_shape
 from ..core.config import Config
 from ..core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
 from ..system.arrays_file import ArraySpec
-from .gaussians import attribute_shapes, motion_layout, motion_shape
+from .gaussians import attribute_shapes, motion_shape, offset_widths
 
 if TYPE_CHECKING:
     from .gaussians import Gaussians
@@ -222,7 +222,8 @@ def basis_offsets(
     num_bases, channels = motion_shape(cfg)
     check_shape(f"motion:N,{num_bases},{channels}", motion=motion)
     total = _WeightedSum.apply(motion, basis_weights(time, cfg.basis), sink, ops)
-    return Offsets.from_channels({name: total[:, part] for name, part in motion_layout(cfg).items()}, cfg)
+    widths = offset_widths(cfg)  # `split` has one gradient; slices have one each, of full size, to add up
+    return Offsets.from_channels(dict(zip(widths, total.split(list(widths.values()), 1), strict=True)), cfg)
 
 
 @dataclass(frozen=True)

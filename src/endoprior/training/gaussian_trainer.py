@@ -33,12 +33,12 @@ from .density import scene_extent
 from .density_stats import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
-from .losses import StartTracks
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
 from .photometric import ClearedFrames, smoke_of
 from .step import TrainingStep
+from .tracks import StartTracks
 from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..model import ops as model_ops
-from . import adam, density_stats, local_motion, losses
+from . import adam, density_stats, local_motion, losses, tracks
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class TrainingOps:
 
     model: model_ops.ModelOps
     supervised_losses: Callable[..., Tensor]
+    track_term: Callable[..., Tensor]
     local_consistency: Callable[..., tuple[Tensor, Tensor]]
     add_gradient: Callable[..., None]
     add_score: Callable[..., None]
@@ -35,6 +36,7 @@ class TrainingOps:
 NUMBA = TrainingOps(
     model=model_ops.NUMBA,
     supervised_losses=losses.supervised_losses_numba,
+    track_term=tracks.track_term_numba,
     local_consistency=local_motion.local_consistency_numba,
     add_gradient=density_stats.add_gradient_numba,
     add_score=density_stats.add_score_numba,
@@ -48,6 +50,7 @@ NUMBA = TrainingOps(
 TORCH = TrainingOps(
     model=model_ops.TORCH,
     supervised_losses=losses.supervised_losses,
+    track_term=tracks.track_term,
     local_consistency=local_motion.local_consistency,
     add_gradient=density_stats.add_gradient,
     add_score=density_stats.add_score,

@@ -24,7 +24,7 @@ from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrame, TrainingFrames
-from .losses import color_l1, track_term
+from .losses import color_l1
 from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
 from .ops import TrainingOps
 from .temporal import temporal_terms
@@ -206,7 +206,7 @@ class TrainingStep:
         error = terms["color"] if is_error else color_l1(drawn.out.color.detach(), frame.rgb, frame.tissue_mask)
         if drawn.offsets is not None and state.tracks is not None:
             means, basis = drawn.gaussians["means"], cfg.deformation.basis
-            term = track_term(means, drawn.offsets.means, state.tracks, frame, drawn.position, basis, self.ops)
+            term = self.ops.track_term(means, drawn.offsets.means, state.tracks, frame, drawn.position, basis)
             terms |= {"track": cfg.loss.track_weight * term}
         if drawn.before is not None:
             terms |= temporal_terms(drawn, drawn.before, self.motion, state.stats, cfg, self.ops)

@@ -25,7 +25,20 @@ import numpy as np
 from numba import njit, prange
 
 from ...compute import simd
-from ...compute.simd import LANES, fma, lane_numbers, larger, load, magnitude, smaller, splat, store, total, where_ge
+from ...compute.simd import (
+    LANES,
+    fma,
+    lane_numbers,
+    larger,
+    load,
+    magnitude,
+    prefetch,
+    smaller,
+    splat,
+    store,
+    total,
+    where_ge,
+)
 from ..constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
 from . import tiles
 from .tiles import FIRST_ROWS, ID, SLOPES, SLOT, STRIPS, TILE_HEIGHT, TILE_WIDTH
@@ -138,7 +151,9 @@ def _blend_tile(records, pairs, left, top, columns, rows, state):
     for r in range(rows):
         for c in range(columns):
             state[c // LANES * FORWARD_STRIP + r * FORWARD_ROW + c % LANES] = f4(1.0)
+    flat_records = records.reshape(-1)
     for p in range(len(pairs)):
+        prefetch(flat_records, pairs[min(p + tiles.AHEAD, len(pairs) - 1), ID] * tiles.RECORD_SIZE)
         _blend_pair(records[pairs[p, ID]], pairs[p], f4(left + 0.5), f4(top + 0.5), state)
         if p % CHECK_EVERY == CHECK_EVERY - 1 and _is_full(state):
             return p + 1
@@ -253,8 +268,12 @@ def _read_tile(color, depth, transmittance, v_color, v_depth, v_alpha, left, top
 @njit(cache=True, error_model="numpy")
 def _differentiate_tile(records, pairs, needed, left, top, state, sums):
     # Writes the partial sums of one tile's pairs, near to far; zeros for those that the forward pass did not need.
+    flat_records, flat_sums = records.reshape(-1), sums.reshape(-1)
     for p in range(needed):
         pair = pairs[p]
+        ahead = pairs[min(p + tiles.AHEAD, needed - 1)]
+        prefetch(flat_records, ahead[ID] * tiles.RECORD_SIZE)
+        prefetch(flat_sums, ahead[SLOT] * NUM_SUMS)
         _differentiate_pair(records[pair[ID]], pair, f4(left + 0.5), f4(top + 0.5), state, sums[pair[SLOT]])
     for p in range(needed, len(pairs)):
         sums[pairs[p, SLOT]] = f4(0.0)

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ...compute.simd import LANES
+from ...compute.simd import LANES, prefetch
 from ..constants import ALPHA_MIN
 
 STRIPS = 2
@@ -24,6 +24,9 @@ TILE_WIDTH, TILE_HEIGHT = STRIPS * LANES, 32
 """px."""
 CHUNKS = 8
 """Runs of the depth order that are counted side by side; the result does not depend on it."""
+AHEAD = 8
+"""Gaussians, or pairs, between asking for the memory of one and using it: their order in memory is not that of depth,
+so that no processor foresees it."""
 
 # Columns of a record: all that compositing reads of one Gaussian, side by side in memory.
 X, Y, ROOT, K, M_LOG2, LOG2_OPACITY, RED, GREEN, BLUE, Z, SLOPES = range(11)
@@ -182,8 +185,12 @@ def _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes,
     # the slot, and how many there are at slot_starts[g + 1]; adds up pairs and strip rows per (chunk, tile).
     for chunk in prange(CHUNKS):
         spans = np.empty((tiles_x * STRIPS, 2), np.int64)
+        flat_records, flat_boxes = records.reshape(-1), boxes.reshape(-1)
         for rank in range(near_to_far.size * chunk // CHUNKS, near_to_far.size * (chunk + 1) // CHUNKS):
             g = near_to_far[rank]
+            ahead = near_to_far[min(rank + AHEAD, near_to_far.size - 1)]
+            prefetch(flat_records, ahead * RECORD_SIZE)
+            prefetch(flat_boxes, box_starts[ahead] * PAIR_SIZE)
             place = box_starts[g]
             first_tile, end_tile = _write_spans(records[g], width, height, spans)
             for tile_column in range(first_tile, end_tile):
@@ -206,8 +213,10 @@ def _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes,
 def _sort_pairs(near_to_far, box_starts, boxes, slot_starts, cursors, pairs):
     # One task per chunk, as above; cursors (CHUNKS, L) say where each chunk's next pair of a tile goes in `pairs`.
     for chunk in prange(CHUNKS):
+        flat_boxes = boxes.reshape(-1)
         for rank in range(near_to_far.size * chunk // CHUNKS, near_to_far.size * (chunk + 1) // CHUNKS):
             g = near_to_far[rank]
+            prefetch(flat_boxes, box_starts[near_to_far[min(rank + AHEAD, near_to_far.size - 1)]] * PAIR_SIZE)
             for i in range(slot_starts[g + 1] - slot_starts[g]):
                 pair = boxes[box_starts[g] + i]
                 place = cursors[chunk, pair[TILE]]
