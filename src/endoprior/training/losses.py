@@ -1,10 +1,6 @@
-"""The terms of Eq. (12) that compare one rendered image with its frame, and the term that holds motion to its tracks.
+"""The terms of Eq. (12) that compare one rendered image with its frame.
 
-Tracks are supervision too: a Gaussian stays on the track that optical flow gave it, wherever flow really saw it. Color
-alone cannot tell which point of flat tissue went where: without this term, training lets tissue slide.
-`N` Gaussians, `P` tracks, `T` training frames, `B` basis functions.
-
-The supervised terms are there twice: in PyTorch, and in Numba with value and gradient in one pass over the image. A
+The terms are there twice: in PyTorch, and in Numba with value and gradient in one pass over the image. A
 dozen small torch operations and their backward passes each read the whole image, which costs as much as rendering it.
 Sums run over rows, then over the rows in order, so they are bit-identical whatever the number of threads.
 """
@@ -28,6 +24,7 @@ from .frames import TrainingFrame
 if TYPE_CHECKING:
     from .ops import TrainingOps
 
+BAND = 16  # rows per task
 MIN_DEPTH_PIXELS = 10  # a frame with fewer pixels of measured tissue depth gets no depth loss
 
 
@@ -170,7 +167,7 @@ class _SupervisedLosses(torch.autograd.Function):
         inverse = np.empty_like(arrays[1])
         sums = np.zeros((height, 5), np.float64)
         _invert(arrays[1], inverse)
-        _rows(*arrays, tv_on_tissue, inverse, factors, v_color, v_depth, sums)
+        _bands(*arrays, tv_on_tissue, inverse, factors, v_color, v_depth, sums)
         ctx.grads = torch.from_numpy(v_color), torch.from_numpy(v_depth)
         totals = sums.sum(0) * factors
         return torch.tensor([totals[0], totals[2], totals[3] + totals[4], totals[1]], dtype=torch.float32)
@@ -201,88 +198,82 @@ def _sign(x):
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
-def _rows(
+def _bands(
     color, depth, target_u8, target_inverse, tissue_mask, measured, tv_on_tissue, inverse, factors,
     v_color, v_depth, sums,
 ):  # fmt: skip
-    # One task per row y: writes v_color[y], v_depth[y], sums[y]: the unweighted (color, edges, depth, two variations).
-    # A variation's gradient is the signs of the differences to the four neighbors: no task writes another's row.
-    # A row is one flat run of numbers, three per pixel for color: loops over it vectorize, loops over channels do not.
+    # One task per BAND rows: writes their v_color and v_depth, and sums[y], unweighted: color, edges, depth, variation
+    # of color and of depth. A row is one flat run of numbers, three per pixel for color: loops over it vectorize.
     height, width = depth.shape
-    scale, one = np.float32(1 / 255), np.float32(1)
     f_color, f_edges, f_depth, f_tv, f_tvd = factors
-    colors, targets = color.reshape(height, 3 * width), target_u8.reshape(height, 3 * width)
-    v_colors = v_color.reshape(height, 3 * width)
-    for y in prange(height):
-        up, down = max(y - 1, 0), min(y + 1, height - 1)
-        # 1 on tissue in this row, the one above and the one below; then where both pixels of a difference are tissue:
-        # to the row above, the row below, the next pixel.
-        tissue, both = np.empty((3, 3 * width), np.float32), np.zeros((3, 3 * width), np.float32)
-        _fill_colors(tissue_mask[y], tissue[0])
-        _fill_colors(tissue_mask[up], tissue[1])
-        _fill_colors(tissue_mask[down], tissue[2])
-        both[0], both[1] = tissue[0] * tissue[1], tissue[0] * tissue[2]
-        both[2, :-3] = tissue[0, :-3] * tissue[0, 3:]
-        sums[y, 0] = _fidelity(colors[y], targets[y], scale, tissue[0], f_color, v_colors[y])
-        if f_edges > 0:
-            errors = np.empty((3, 3 * width), np.float32)
-            _fill_errors(colors[up], targets[up], scale, errors[0])
-            _fill_errors(colors[y], targets[y], scale, errors[1])
-            _fill_errors(colors[down], targets[down], scale, errors[2])
-            sums[y, 1] = _variation(errors[0], errors[1], errors[2], 3, f_edges, both, v_colors[y])
-        if tv_on_tissue:
-            both[:] = one
-        else:
-            both[:] = one - both
-        sums[y, 3] = _variation(colors[up], colors[y], colors[down], 3, f_tv, both, v_colors[y])
-        weight = np.empty(width, np.float32)
-        for x in range(width):
-            weight[x] = np.float32(measured[y, x])
-            for k in range(3):
-                both[k, x] = both[k, 3 * x]
-        sums[y, 2] = _fidelity(inverse[y], target_inverse[y], one, weight, f_depth, v_depth[y])
-        sums[y, 4] = _variation(inverse[up], inverse[y], inverse[down], 1, f_tvd, both, v_depth[y])
-        for x in range(width):
-            v_depth[y, x] *= -inverse[y, x] * inverse[y, x]
+    f_tissue = np.float32(tv_on_tissue)
+    colors, v_colors = color.reshape(height, 3 * width), v_color.reshape(height, 3 * width)
+    targets = target_u8.reshape(height, 3 * width)
+    for band in prange((height + BAND - 1) // BAND):
+        # Of two rows in turn: errors and tissue of color, errors and tissue of depth.
+        rows3, rows1 = np.empty((2, 2, 3 * width), np.float32), np.empty((2, 2, width), np.float32)
+        # Gradients of the differences to the row above, and to the pixel on the left (`step` numbers later).
+        above3, left3 = np.zeros(3 * width, np.float32), np.zeros(3 * width + 3, np.float32)
+        above1, left1 = np.zeros(width, np.float32), np.zeros(width + 1, np.float32)
+        weight, spare3 = np.empty(width, np.float32), np.empty(3 * width, np.float32)
+        begin, end = band * BAND, min((band + 1) * BAND, height)
+        first = max(begin - 1, 0)
+        _fill(first, colors, targets, inverse, target_inverse, tissue_mask, rows3[first % 2], rows1[first % 2])
+        for y in range(first, end):
+            here, below = y % 2, min(y + 1, height - 1)
+            there = below % 2
+            if below > y:
+                _fill(below, colors, targets, inverse, target_inverse, tissue_mask, rows3[there], rows1[there])
+            for x in range(width):
+                weight[x] = np.float32(measured[y, x])
+            # The row above a band only gives differences: its own gradient is another task's.
+            v3, v1 = (v_colors[y], v_depth[y]) if y >= begin else (spare3, weight)
+            shades = rows3[here, 1], rows3[here], rows3[there], colors[y], colors[below]
+            near = _differences(*shades, 3, f_color, f_edges, f_tv, f_tissue, above3, left3, v3)
+            depths = weight, rows1[here], rows1[there], inverse[y], inverse[below]
+            far = _differences(*depths, 1, f_depth, np.float32(0), f_tvd, f_tissue, above1, left1, v1)
+            if y >= begin:
+                sums[y, 0], sums[y, 1], sums[y, 2], sums[y, 3], sums[y, 4] = near[0], near[1], far[0], near[2], far[2]
+                for x in range(width):
+                    v_depth[y, x] *= -inverse[y, x] * inverse[y, x]
 
 
-@njit(cache=True, inline="always")
-def _fidelity(row, target, scale, weight, factor, v_row):
-    # Weighted sum of |row - scale * target|; sets v_row to `factor` times its gradient.
-    total = np.float32(0)
-    for i in range(len(row)):
-        e = row[i] - np.float32(target[i]) * scale
-        total += weight[i] * abs(e)
-        v_row[i] = factor * weight[i] * _sign(e)
-    return total
+@njit(cache=True)
+def _fill(y, colors, targets, inverse, target_inverse, tissue_mask, row3, row1):
+    # Errors and tissue of row y, for color (2, 3 W) and for depth (2, W).
+    scale = np.float32(1 / 255)
+    for x in range(inverse.shape[1]):
+        row1[0, x], row1[1, x] = inverse[y, x] - target_inverse[y, x], np.float32(tissue_mask[y, x])
+        row3[1, 3 * x] = row3[1, 3 * x + 1] = row3[1, 3 * x + 2] = row1[1, x]
+    for i in range(colors.shape[1]):
+        row3[0, i] = colors[y, i] - np.float32(targets[y, i]) * scale
 
 
-@njit(cache=True, inline="always")
-def _fill_colors(mask, values):
-    # Writes a mask (W,) as 0 and 1, three numbers per pixel.
-    for x in range(len(mask)):
-        values[3 * x] = values[3 * x + 1] = values[3 * x + 2] = np.float32(mask[x])
-
-
-@njit(cache=True, inline="always")
-def _fill_errors(row, target, scale, errors):
-    for i in range(len(row)):
-        errors[i] = row[i] - np.float32(target[i]) * scale
-
-
-@njit(cache=True, inline="always")
-def _variation(above, row, below, step, factor, counted, v_row):
-    # Weighted sum of |differences| to the next pixel, `step` numbers on, and to the row below; adds `factor` times the
-    # gradient of the whole image's variation to v_row. `counted` (3, .): weights of the differences to the row above,
-    # the row below and the next pixel.
-    total = np.float32(0)
-    size = len(row)
+@njit(cache=True, fastmath=REORDERED)
+def _differences(weight, here, there, row, below, step, factor, f_edges, f_tv, f_tissue, above, left, v_row):
+    # Sums of one row: weighted |error|, |difference of errors| on tissue, |difference of values| elsewhere and, where
+    # f_tissue is 1, on tissue, to the row below and to the next pixel. Sets v_row to the gradient. The last row is its
+    # own row below: all differences are 0.
+    error, tissue, error_below, tissue_below = here[0], here[1], there[0], there[1]
+    one, size = np.float32(1), len(row)
+    fidelity = edges = variation = np.float32(0)
     for i in range(size):
-        total += counted[1, i] * abs(below[i] - row[i])
-        v_row[i] += factor * (counted[0, i] * _sign(row[i] - above[i]) - counted[1, i] * _sign(below[i] - row[i]))
+        fidelity += weight[i] * abs(error[i])
+        both = tissue[i] * tissue_below[i]
+        free = one - both + f_tissue * both
+        of_error, of_value = error_below[i] - error[i], below[i] - row[i]
+        edges += both * abs(of_error)
+        variation += free * abs(of_value)
+        down = f_edges * both * _sign(of_error) + f_tv * free * _sign(of_value)
+        v_row[i] = factor * weight[i] * _sign(error[i]) + above[i] - down
+        above[i] = down
     for i in range(size - step):
-        total += counted[2, i] * abs(row[i + step] - row[i])
-        v_row[i] -= factor * counted[2, i] * _sign(row[i + step] - row[i])
-    for i in range(step, size):
-        v_row[i] += factor * counted[2, i - step] * _sign(row[i] - row[i - step])
-    return total
+        both = tissue[i] * tissue[i + step]
+        free = one - both + f_tissue * both
+        of_error, of_value = error[i + step] - error[i], row[i + step] - row[i]
+        edges += both * abs(of_error)
+        variation += free * abs(of_value)
+        left[i + step] = f_edges * both * _sign(of_error) + f_tv * free * _sign(of_value)
+    for i in range(size):
+        v_row[i] += left[i] - left[i + step]
+    return fidelity, edges, variation

@@ -1,5 +1,7 @@
-"""Motion is held to the tracks that it started on: the term, in PyTorch for any device, then in Numba for the CPU.
+"""The term that holds motion to the tracks that it started on, in PyTorch for any device, then in Numba for the CPU.
 
+A Gaussian stays on the track that optical flow gave it, wherever flow really saw it. Color alone cannot tell which
+point of flat tissue went where: without this term, training lets tissue slide.
 `N` Gaussians, `P` tracks, `B` basis functions, `T` training frames.
 """
 
