@@ -7,7 +7,7 @@ differs from the release, and why, is in docs/methods.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -24,18 +24,17 @@ from endoprior.initialization.first_gaussians import FirstGaussians, resting_sph
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Field, Motion, Offsets
 from endoprior.model.ops import ModelOps
-from endoprior.model.presets import paper
 from endoprior.render.projection import rotation_matrices
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan
-from endoprior.training.gaussian_method import GaussianMethod, in_epochs
+from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_linear, rate_of
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
-from .surface_points import grid_points
+from .surface_points import Released, grid_points
 from .time_network import TimeNetwork, state_shapes
 
 UNIT_MM = 100.0
@@ -106,34 +105,22 @@ class NetworkMotion(Motion):
         )
 
 
-class SurgicalGaussian(GaussianMethod):
+class SurgicalGaussian(Released):
     """See `GaussianMethod`."""
 
     background = (1.0, 1.0, 1.0)
-    uses_prior = False
     first_share = 1 / EVERY_PX**2
-    _motion = NetworkMotion()
-
-    def config(self) -> Config:
-        """What its preset starts from. Published: 40,000 iterations, growth before 15,000, decay over 30,000."""
-        return paper().replace(
-            {
-                "method": "surgicalgaussian",
-                "temporal.weight": 0.0,
-                "density.stop_iteration": 1500,
-                "density.grow_threshold": 3e-4,
-                "density.min_densify_weight": 1.0,
-                "optim.scales_lr": 1e-3,
-                "optim.decay_iterations": 3000,
-                "schedule.coarse_iterations": 0,
-                "schedule.fine_iterations": 4000,
-                "schedule.sh_every": 1000,
-            }
-        )
-
-    @override
-    def motion(self, cfg: Config) -> Motion:
-        return self._motion
+    name = "surgicalgaussian"
+    way = NetworkMotion()
+    changes: ClassVar[Mapping[str, Any]] = {  # published: 40,000 iterations, growth before 15,000, decay over 30,000
+        "density.stop_iteration": 1500,
+        "density.grow_threshold": 3e-4,
+        "optim.scales_lr": 1e-3,
+        "optim.decay_iterations": 3000,
+        "schedule.coarse_iterations": 0,
+        "schedule.fine_iterations": 4000,
+        "schedule.sh_every": 1000,
+    }
 
     @override
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
