@@ -66,7 +66,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["endonerf", pytest.param("endosurf", marks=pytest.mark.slow)])
 def test_a_resumed_run_is_bit_identical(name: str, sequence: FrameSequence, tmp_path: Path):
     cfg = tiny(name, 4, refine_every=3 if name == "endonerf" else 0)
     whole = started(sequence, name, cfg)

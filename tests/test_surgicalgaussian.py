@@ -21,8 +21,16 @@ from endoprior.training.ops import NUMBA
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 from endoprior_baselines.surface_points import grid_points
-from endoprior_baselines.surgicalgaussian import METHOD, covariances, distance_change, neighbor_terms, ssim
-from endoprior_baselines.time_network import TimeNetwork, encoded, state_shapes
+from endoprior_baselines.surgicalgaussian import (
+    METHOD,
+    TimeNetwork,
+    covariances,
+    distance_change,
+    encoded,
+    neighbor_terms,
+    ssim,
+    state_shapes,
+)
 
 CFG = preset("surgicalgaussian")
 

@@ -231,6 +231,7 @@ def test_each_gaussian_has_a_color_also_behind_the_camera(scene):
     assert len(cloud.colors) == len(cloud.points) == len(scene)
 
 
+@pytest.mark.slow
 def test_play_advances_and_pauses(viewer, client):
     client.set(viewer.panel.speed, "0.5x")
     client.set(viewer.panel.play, True)
@@ -257,6 +258,7 @@ def test_a_browser_can_render_the_gaussians_itself(viewer, client):
     demand(viewer.panel.layer, LAYER_NAMES["depth"], "BackgroundImageMessage")  # no color of a Gaussian
 
 
+@pytest.mark.slow
 def test_screenshot_and_video_are_stored_in_the_run(viewer, client):
     client.set(viewer.panel.screenshot, True)
     client.set(viewer.panel.camera, ORBIT)
@@ -274,6 +276,7 @@ def test_the_server_binds_to_this_machine_only(viewer):
     assert viewer.server.get_host() == "127.0.0.1" and viewer.server.request_share_url() is None
 
 
+@pytest.mark.slow
 def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
     sequence = load_sequence(tiny_sequence)
     viewable = ViewableSequence(sequence)
