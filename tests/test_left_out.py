@@ -51,6 +51,7 @@ def sequence(make_tiny_sequence, monkeypatch):
 CFG = tiny_config("basis", coarse=1, fine=25).replace({"trust_masks": False})
 
 
+@pytest.mark.slow
 def test_a_run_records_the_frames_and_names_them_with_the_command(sequence, tmp_path):
     run = tmp_path / "run"
     train(sequence, CFG, run, progress=False)

@@ -90,6 +90,7 @@ def test_poses_are_found_and_the_originals_kept(metric, folder, capsys):
     assert (folder / "poses_bounds_before.npy").read_bytes() == (metric / "poses_bounds.npy").read_bytes()
 
 
+@pytest.mark.slow
 def test_relative_depth_is_brought_to_the_path_also_twice(relative, tmp_path):
     folder = shutil.copytree(relative, tmp_path / "DATA")
     assert np.ptp(depth_ratios(folder)) > 0.5

@@ -209,6 +209,7 @@ def test_growth_removal_and_resets():
 # All together.
 
 
+@pytest.mark.slow
 def test_it_trains_resumes_with_equal_bits_and_comes_back(tiny_sequence, tmp_path):
     changes = {"density.start_iteration": 2, "density.every": 3, "schedule.sh_every": 3}
     cfg = preset("surgicalgaussian", iterations=8, **changes)

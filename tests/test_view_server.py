@@ -175,6 +175,7 @@ def test_a_track_fades_where_a_tool_hides_its_point_or_where_it_is_uncertain(sce
     assert not tracks.lines(4, False).dots.any(), "not certain there any more"
 
 
+@pytest.mark.slow
 def test_every_quantity_is_measured_and_saved_as_a_table(viewer, client):
     client.set(viewer.panel.measure, True)
     client.set(viewer.panel.quantity, AREA)
