@@ -25,7 +25,7 @@ from endoprior.priors import joint_texture_prior, salience, specular_likelihood
 from endoprior.training.temporal import MOTION_TEMPERATURE, MOTION_THRESHOLD, motion_weight
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
-from endoprior.visualization.camera_paths import turned
+from endoprior.visualization.rendered_views import turned
 
 PHANTOM = ("--frames", 24, "--width", 320, "--height", 256)
 FRAME = 12

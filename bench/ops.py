@@ -20,7 +20,7 @@ from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer, motion_rates, rate_of
 from endoprior.training.temporal import MOST_POINTS
-from endoprior_baselines.time_network import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
+from endoprior_baselines.surgicalgaussian import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
 TIME, RATE, EPSILON = 0.4, 1e-3, 1e-15
 EARLIER_TIMES = (0.05, 0.2, 0.6, 0.85)

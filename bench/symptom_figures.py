@@ -18,7 +18,7 @@ import endoprior
 from endoprior.data.images import save_png
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
-from endoprior.visualization.camera_paths import turned
+from endoprior.visualization.rendered_views import turned
 
 PHANTOM = ("--frames", 16, "--width", 160, "--height", 128, "--no-side-views")
 FRAME = 9

@@ -26,7 +26,6 @@ VALUES = {
         "--max-width": ("-1", HUGE),
         **dict.fromkeys(("--depth-unit-mm", "--working-distance-mm", "--field-of-view-degrees"), ("nan",)),
         "--stereo.near-mm": ("nan", "0", "1e30"),
-        "--stereo.block-px": ("4", HUGE),
         "--crop": ("1,2", "a,b,c,d", "-1,0,5,5", "0,0,0,0", "0,0,99999,9"),
         "--blank": ("nan,0,1,1", "1,2,3"),
     },

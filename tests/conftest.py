@@ -106,7 +106,7 @@ def write_tiny_sequence(
 def few_vessels() -> Iterator[None]:
     """To grow the vessels of a phantom takes longer than all the rest of a small one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endoprior.phantom.vessels.TREES", 100)
+        patch.setattr("endoprior.phantom.texture.TREES", 100)
         yield
 
 
@@ -114,7 +114,7 @@ def few_vessels() -> Iterator[None]:
 def all_vessels() -> Iterator[None]:
     """As many as for a user, in the files that use this fixture."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endoprior.phantom.vessels.TREES", 1000)
+        patch.setattr("endoprior.phantom.texture.TREES", 1000)
         yield
 
 

@@ -122,6 +122,7 @@ def test_training_gets_the_estimated_path_and_the_sequence_is_only_read(finished
         assert load_sequence(copy, DataConfig()).camera(0).fx == MATRIX[0, 0]
 
 
+@pytest.mark.slow
 def test_the_path_is_compared_with_the_given_one(finished):
     matrix, trained, _, _ = finished
     own, posed, both = (scores_of(matrix.done[cell]) for cell in (OWN, POSED, BOTH))
@@ -135,6 +136,7 @@ def test_the_path_is_compared_with_the_given_one(finished):
     assert fingerprints == {load_sequence(matrix.data["clip"], DataConfig()).fingerprint()}
 
 
+@pytest.mark.slow
 def test_the_report_shows_what_the_estimated_path_costs(finished):
     matrix, _, _, _ = finished
     text = write_report(matrix, matrix.out).read_text()

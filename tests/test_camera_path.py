@@ -269,6 +269,7 @@ def test_the_principal_point_may_lie_at_the_edge_of_the_image():
     assert found.explained.all() and np.linalg.norm(off, axis=1).max() < 2.0  # mm, by half of the view
 
 
+@pytest.mark.slow
 def test_a_mapping_that_was_stopped_is_told_whichever_path_is_taken(monkeypatch):
     assert not colmap.time_note(59.9, 60.0) and "stopped after 60 s" in colmap.time_note(60.2, 60.0)[0]
     frames = [view(pose) for pose in path(10, 2.0)]

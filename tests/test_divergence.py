@@ -84,7 +84,9 @@ def started(folder, cfg):
     return trainer
 
 
-@pytest.mark.parametrize("name", ["default", "deform3dgs", "endogs", "endo4dgs", "surgicalgaussian"])
+@pytest.mark.parametrize(
+    "name", ["default", "deform3dgs", pytest.param("endogs", marks=pytest.mark.slow), "endo4dgs", "surgicalgaussian"]
+)
 def test_every_method_is_watched_by_its_error_on_tissue(tiny_sequence, name, monkeypatch):
     """Whatever unit and region its own color term has; and an image of nothing but background ends the run."""
     monkeypatch.setattr(divergence, "WINDOW", 4)
@@ -138,7 +140,7 @@ def poison(trainer, name, value):
     return trainer.state.gaussians[name].register_hook(spoil)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["basis", pytest.param("hexplane", marks=pytest.mark.slow)])
 def test_an_unusable_gradient_stops_before_anything_changes(tiny_sequence, kind):
     trainer = started(tiny_sequence, tiny_config(kind, fine=40))
     for _ in range(8):
@@ -221,7 +223,7 @@ def as_on_a_device(trainer):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["means", "opacity_logits"])
+@pytest.mark.parametrize("name", ["means", pytest.param("opacity_logits", marks=pytest.mark.slow)])
 def test_a_late_check_finds_the_state_before_a_bad_gradient(tiny_sequence, kind, name):
     trainer = as_on_a_device(started(tiny_sequence, quiet(kind)))
     for _ in range(8):

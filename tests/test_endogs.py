@@ -201,6 +201,7 @@ def test_it_grows_often_prunes_seldom_and_resets():
 # All together.
 
 
+@pytest.mark.slow
 def test_it_trains_resumes_with_equal_bits_and_comes_back(tiny_sequence, tmp_path):
     scene = trained_and_resumed(load_sequence(tiny_sequence), tiny(), tmp_path, stop_at=4)
     assert isinstance(scene.field, JointField) and len(scene) != 200, "it grew"

@@ -125,6 +125,7 @@ def test_a_new_layout_is_recognized_and_opened(extend, tmp_path, tiny_sequence):
     assert run(tmp_path, "-c", LOAD, tmp_path / "new").splitlines() == ["auto 17 40 48 3", "rendered 17 40 48 3"]
 
 
+@pytest.mark.slow
 def test_a_new_export_format_is_offered_and_written(extend, tmp_path, tiny_sequence):
     extend("export.md", "export/xyz.py", "export/formats.py", "FORMATS", '"{0}": "{0}:FORMAT"', "{")
     scene = tiny_scene(tiny_sequence)

@@ -94,6 +94,7 @@ def test_exports_know_the_split_without_the_sequence(tiny_sequence, data):
         assert frame_indices(len(sequence), split, data) == sequence.indices(split)
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_fold_and_is_scored_on_it(tiny_sequence, tmp_path, capsys):
     """Phase 7, so that the first frame is held out, from which everything else would begin."""
     run = tmp_path / "run"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from player_page import RATE, WIDTH, open_player, picture, random_scene, rendere
 
 from endoprior.core.checks import InputError
 from endoprior.export.html import write_html
+from endoprior.model.photometric import GRID, filmed_torch
 from endoprior.model.scene import Scene
 from endoprior.render import sh
 
@@ -126,6 +128,32 @@ def test_draws_what_the_renderer_draws(scene, page, kept):
         assert error.mean() < 0.65 and want.std() > 20
     assert not page.problems
     assert all(address.startswith(("file://", "blob:")) for address in page.requests)
+
+
+def test_smoke_is_shown_when_asked_for_and_where_there_is_some(scene, page, tmp_path, kept):
+    assert page.evaluate("smoke.hidden")
+    rows, columns = torch.meshgrid(torch.linspace(0, 1, GRID[0]), torch.linspace(0, 1, GRID[1]), indexing="ij")
+    veil = torch.stack([1 - 0.7 * columns, 0.5 * columns * rows], -1)  # thick at the right, bright at the bottom
+    grids = torch.stack([torch.lerp(torch.tensor([1.0, 0.0]), veil, t / NUM_FRAMES) for t in range(NUM_FRAMES)])
+    smoky = replace(scene, smoke=grids)
+    open_player(page, write_html(smoky, tmp_path / "smoke.html"))
+    page.evaluate("slider.value = 4; slider.dispatchEvent(new Event('input'))")
+    settle(page, 4)
+    tissue = picture(page, kept / "tissue.png")
+    assert np.abs(tissue - rendered(scene, 4 / NUM_FRAMES)).mean() < 0.65
+    page.click("#smoke")
+    settle(page)
+    with torch.no_grad():
+        want = 255 * filmed_torch(torch.from_numpy(rendered(scene, 4 / NUM_FRAMES) / 255), grids[4]).numpy()
+    got = picture(page, kept / "smoke.png")
+    print(f"smoke: {np.abs(want - tissue).mean():.1f} levels, off by {np.abs(got - want).mean():.3f}")
+    assert np.abs(want - tissue).mean() > 20 and np.abs(got - want).mean() < 0.9
+    page.press("f")
+    assert page.evaluate("smoke.disabled")
+    page.press("e")
+    page.press("s")
+    settle(page)
+    assert np.array_equal(picture(page, kept / "off.png"), tissue) and not page.problems
 
 
 @pytest.mark.slow

@@ -163,6 +163,7 @@ def test_single_samples_follow_the_distribution(rho, mask, monkeypatch):
     assert chisquare(drawn[possible], draws * probability[possible]).pvalue > 1e-4
 
 
+@pytest.mark.slow
 def test_a_million_samples_without_replacement_follow_the_distribution(rho, mask, monkeypatch):
     # Tiled 1,250 times, each pixel is so rare that drawing 2 % of the field leaves the odds as they were.
     monkeypatch.setattr(sampling, "EROSION_PX", 5)

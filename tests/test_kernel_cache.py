@@ -74,7 +74,14 @@ def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold):
 OTHERS = [name for name in METHODS.names() if name != OWN and method_named(name).has_gaussians]
 
 
-@pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian", *OTHERS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "default",
+        "paper",
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ("released", "endogaussian", *OTHERS)),
+    ],
+)
 def test_the_warm_up_reaches_every_part_of_a_preset(name):
     cfg = shortened(preset(name))
     trainer = GaussianTrainer(tiny_sequence(), cfg)

@@ -10,7 +10,7 @@ from tiny_training import tiny_config
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.data.folder_edits import note_found_masks
+from endoprior.data.writer import note_found_masks
 from endoprior.runs.folder import CONFIG, LOG, check_state, load_checkpoint, save_checkpoint
 from endoprior.runs.log import missed_tools_line, missed_tools_of
 from endoprior.runs.train import train
@@ -51,6 +51,7 @@ def sequence(make_tiny_sequence, monkeypatch):
 CFG = tiny_config("basis", coarse=1, fine=25).replace({"trust_masks": False})
 
 
+@pytest.mark.slow
 def test_a_run_records_the_frames_and_names_them_with_the_command(sequence, tmp_path):
     run = tmp_path / "run"
     train(sequence, CFG, run, progress=False)

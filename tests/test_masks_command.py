@@ -11,8 +11,8 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.data.folder_edits import replace_masks, writable_masks
 from endoprior.data.images import read_tool_mask
+from endoprior.data.writer import replace_masks, writable_masks
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.visualization.image_tools import mask_sheet
 

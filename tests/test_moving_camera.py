@@ -102,6 +102,7 @@ def known(phantom, scene):
 # --- world axes
 
 
+@pytest.mark.slow
 def test_a_rigid_motion_of_the_world_changes_no_score(phantom, scene, known):
     there = scores_of(moved_world(scene, transform([30, -20, 15], [20, -50, 100])), phantom)
     groups = ("psnr_behind_tool", "side_psnr", "side_veil", "right_psnr", "track_error_mm", "depth_instability_mm")

@@ -25,7 +25,7 @@ BOTH = pytest.mark.parametrize("ops", [NUMBA, TORCH], ids=lambda ops: ops.model.
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("ends", ["current", "both"])
+@pytest.mark.parametrize("ends", [pytest.param("current", marks=pytest.mark.slow), "both"])
 def test_training_agrees(tiny_sequence, kind, ends):
     cfg = tiny_config(kind)
     cfg = replace(cfg, temporal=replace(cfg.temporal, gradient=ends))

@@ -6,8 +6,7 @@ import pytest
 from painted_borders import HEIGHT, NOT_ROUND, WIDTH, finish, tissue
 
 from endoprior.data.images import read_color
-from endoprior.footage.border import find_outline
-from endoprior.footage.outside import beyond, find_outside
+from endoprior.footage.border import beyond, find_outline, find_outside
 from endoprior.footage.overlays import find_strokes, without_strokes
 from endoprior.phantom import PhantomConfig, write_phantom
 

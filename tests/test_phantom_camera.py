@@ -147,6 +147,7 @@ def test_loops_in_the_middle_stay_and_more_surround_them():
     assert np.abs(wide.paths[count:]).max() > 85
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [

@@ -13,9 +13,8 @@ from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.camera import STILL, Eye
 from endoprior.phantom.config import Tissue
 from endoprior.phantom.raster import FAR
-from endoprior.phantom.scene import Moment, build_scene
+from endoprior.phantom.scene import Moment, Smoke, build_scene
 from endoprior.phantom.sensor import develop, exposure_gain, metered, next_gain, vignette
-from endoprior.phantom.smoke import Smoke
 from endoprior.phantom.surface import build_anatomy, organs_at
 from endoprior.phantom.texture import LOOKS, bled
 from endoprior.phantom.views import render_view

@@ -29,6 +29,7 @@ def start_swaying(page: Page, player: str) -> None:
     page.wait_for("document.body.dataset.sway == 'on' && Number(picture.dataset.drawn) > 3", timeout=60)
 
 
+@pytest.mark.slow
 def test_it_sways_until_the_first_touch_and_then_shows_the_recorded_view(player: str) -> None:
     with open_page(player, width=600, height=500) as page:
         still = settled(page)

@@ -119,8 +119,11 @@ def test_a_static_camera_and_blank_images_say_nothing(seen):
     ("name", "unit", "words"),
     [
         ("opengl", 1.0, ["--poses-convention", "opengl"]),
-        ("world-to-camera", 1000.0, ["--poses-convention", "world-to-camera", "--poses-unit-mm", "1000"]),
-        ("opencv", 1000.0, ["--poses-unit-mm", "1000"]),
+        pytest.param(
+            *("world-to-camera", 1000.0, ["--poses-convention", "world-to-camera", "--poses-unit-mm", "1000"]),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("opencv", 1000.0, ["--poses-unit-mm", "1000"], marks=pytest.mark.slow),
     ],
 )
 def test_poses_of_another_convention_are_noticed_by_all_commands_and_corrected(

@@ -90,6 +90,7 @@ def test_poses_are_found_and_the_originals_kept(metric, folder, capsys):
     assert (folder / "poses_bounds_before.npy").read_bytes() == (metric / "poses_bounds.npy").read_bytes()
 
 
+@pytest.mark.slow
 def test_relative_depth_is_brought_to_the_path_also_twice(relative, tmp_path):
     folder = shutil.copytree(relative, tmp_path / "DATA")
     assert np.ptp(depth_ratios(folder)) > 0.5
@@ -143,7 +144,7 @@ def test_bad_input_gives_one_line_and_changes_nothing(folder, tmp_path, kind, ca
         np.save(tmp_path / "few.npy", TRUE[:3])
         options = ["--poses", str(tmp_path / "few.npy")]
     else:
-        monkeypatch.setattr("endoprior.data.folder_edits.os.access", lambda *args: False)
+        monkeypatch.setattr("endoprior.data.writer.os.access", lambda *args: False)
     before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     assert main(["poses", str(folder), *options]) == 2
     said = capsys.readouterr().err.strip().splitlines()

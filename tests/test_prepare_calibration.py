@@ -126,6 +126,7 @@ def test_the_fix_of_a_camera_for_another_size_corrects_depth_too(tmp_path):
 # --- Options together
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_stored_pixels", [False, True])
 def test_squeezed_eyes_of_pixels_that_are_not_square(tmp_path, capsys, of_stored_pixels):
     frames = [np.concatenate(each, 1) for each in PAIRS]

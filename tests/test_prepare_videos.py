@@ -111,7 +111,7 @@ def test_damaged_frames_are_marked_and_only_they(tmp_path):
     assert [finding.what for finding in findings if finding.code == "video"] == list(notes)
 
 
-@pytest.mark.parametrize("start", ["black", "bars"])
+@pytest.mark.parametrize("start", [pytest.param("black", marks=pytest.mark.slow), "bars"])
 def test_the_first_images_do_not_decide_the_layout(tmp_path, start):
     images = smooth(24, 64, 96)
     empty = np.zeros_like(images[0])
@@ -170,7 +170,11 @@ LEFT_OUT = "images have none of the second camera and are left out"
     ("kept", "said"),
     [
         ([i for i in range(30) if i != 11], [f"l.mp4: 1 {LEFT_OUT}"]),  # one is lost
-        (list(range(12)), [f"l.mp4: 18 {LEFT_OUT}", "r.mp4: it ends 0.72 s before the first video"]),
+        pytest.param(
+            list(range(12)),
+            [f"l.mp4: 18 {LEFT_OUT}", "r.mp4: it ends 0.72 s before the first video"],
+            marks=pytest.mark.slow,
+        ),
         (
             list(range(3, 30)),
             ["r.mp4: by its time stamps it starts 0.12 s after the first video", f"l.mp4: 3 {LEFT_OUT}"],

@@ -85,6 +85,7 @@ def test_what_was_written_is_read(made):
         assert sorted(sequence.indices("train") + sequence.indices("test")) == sequence.indices("video")
 
 
+@pytest.mark.slow
 @examples(15)
 @given(recordings(), st.integers(1, 3), st.integers(1, 3))
 def test_polarity_stride_and_shrink_change_what_they_say(made, stride, shrink):

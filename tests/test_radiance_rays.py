@@ -11,18 +11,20 @@ from endoprior.core.geometry import pixel_centers, project
 from endoprior.core.types import Camera
 from endoprior_baselines.radiance import endonerf, endosurf
 from endoprior_baselines.radiance.endosurf import first_crossing
-from endoprior_baselines.radiance.rays import all_rays, rays_of, to_perspective
-from endoprior_baselines.radiance.sampling import (
+from endoprior_baselines.radiance.rays import (
     Composited,
+    all_rays,
     by_weight,
     centers,
     composited,
     density_alpha,
     even,
     jittered,
+    rays_of,
     sphere_ends,
     surface_alpha,
     surface_places,
+    to_perspective,
 )
 from endoprior_baselines.radiance.trainer import due, refined
 

@@ -66,7 +66,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["endonerf", pytest.param("endosurf", marks=pytest.mark.slow)])
 def test_a_resumed_run_is_bit_identical(name: str, sequence: FrameSequence, tmp_path: Path):
     cfg = tiny(name, 4, refine_every=3 if name == "endonerf" else 0)
     whole = started(sequence, name, cfg)
@@ -84,7 +84,7 @@ def test_a_resumed_run_is_bit_identical(name: str, sequence: FrameSequence, tmp_
     assert same(dict(whole.scene().field.state_dict()), dict(second.scene().field.state_dict()))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["endonerf", pytest.param("endosurf", marks=pytest.mark.slow)])
 def test_training_lowers_the_loss(name: str, sequence: FrameSequence, monkeypatch: pytest.MonkeyPatch):
     trainer, found = started(sequence, name, tiny(name, 12)), []
     batch = trainer.batch(np.random.default_rng(0))

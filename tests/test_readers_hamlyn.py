@@ -13,7 +13,7 @@ from sequence_edits import change_poses, write
 
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.footage.outside import find_outside
+from endoprior.footage.border import find_outside
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
 CROP = 4

@@ -53,7 +53,10 @@ def test_every_command_that_takes_data_names_prepare_for_a_video(tmp_path, frame
     assert sorted(path.name for path in tmp_path.iterdir()) == ["my clip.mp4"]
 
 
-@pytest.mark.parametrize("kind", ["a video", "a folder of images", "a folder with a video"])
+@pytest.mark.parametrize(
+    "kind",
+    ["a video", *(pytest.param(f"a folder {what}", marks=pytest.mark.slow) for what in ("of images", "with a video"))],
+)
 def test_the_printed_commands_work(tmp_path, frames, capsys, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("endoprior.check.draw_check", lambda *_: None)

@@ -18,10 +18,10 @@ from endoprior.core.checks import InputError
 from endoprior.evaluation.registry import all_scores
 from endoprior.model.presets import preset
 from endoprior_studies.matrix import Matrix
-from endoprior_studies.published import FIGURES, published_blocks, published_table, rows_of
 from endoprior_studies.results import Results
 from endoprior_studies.spec import Cell, Choice
 from endoprior_studies.spec_file import find_spec, load_spec, load_specs, spec_names, specs_of
+from endoprior_studies.tables import FIGURES, published_blocks, published_table, rows_of
 from endoprior_studies.timing import Speed, parts_of, shortened
 
 TABLES = [name for name in spec_names() if name.startswith("reproduce/")]

@@ -209,6 +209,7 @@ def test_an_extension_that_is_none(interrupted, tmp_path, total, capsys):
     assert {file.name: file.read_bytes() for file in run.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_an_extension_changes_the_length_only(interrupted, parts, capsys):
     before = (parts / "config.json").read_bytes()
     assert main(["train", "--resume", str(parts), "--iterations", "5"]) == 2

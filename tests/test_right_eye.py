@@ -18,7 +18,7 @@ from endoprior.core.types import Camera, RenderedView
 from endoprior.data import load_sequence
 from endoprior.evaluation.context import NO_SCENE, Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.scorers import other_views
-from endoprior.footage.right_view import NEAREST, measured_disparity, right_camera, right_disparity, warp_to_right
+from endoprior.footage.stereo_order import NEAREST, measured_disparity, right_camera, right_disparity, warp_to_right
 from endoprior.phantom import PhantomConfig, write_phantom
 
 BASELINE = 4.0

@@ -102,6 +102,7 @@ def test_images_and_prompts_are_prepared_as_by_the_library(model):
     assert (session.mask_inputs_per_obj[0][0] == segmenter.prompt(mask)).all()
 
 
+@pytest.mark.slow
 @needs_transformers
 def test_the_command_replaces_masks(model, phantom, tmp_path, capsys):
     folder = shutil.copytree(phantom, tmp_path / "DATA")

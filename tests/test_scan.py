@@ -67,11 +67,10 @@ def test_the_longest_clear_segment_is_chosen_and_a_scan_is_kept(disturbed, tmp_p
     assert [round(time * RATE) for time in again.span] == [18, 30]
 
 
-@pytest.mark.parametrize("number", ["-1", "6"])
-def test_a_segment_that_is_not_there_is_named(disturbed, tmp_path, capsys, number):
-    words = ["run", str(disturbed / "images"), str(tmp_path / "out"), "--folder-rate", "10", "--segment", number]
+def test_a_segment_that_is_not_there_is_named(disturbed, tmp_path, capsys):
+    words = ["run", str(disturbed / "images"), str(tmp_path / "out"), "--folder-rate", "10", "--segment", "6"]
     assert main(words) == 2
-    assert f"--segment: expected the number of a segment, got {number}, with 5 in" in capsys.readouterr().err
+    assert "--segment: expected the number of a segment, got 6, with 5 in" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert main([*words, "--start", "1"]) == 2
     assert "--segment: expected no --start" in capsys.readouterr().err

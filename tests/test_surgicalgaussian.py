@@ -21,8 +21,16 @@ from endoprior.training.ops import NUMBA
 from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 from endoprior_baselines.surface_points import grid_points
-from endoprior_baselines.surgicalgaussian import METHOD, covariances, distance_change, neighbor_terms, ssim
-from endoprior_baselines.time_network import TimeNetwork, encoded, state_shapes
+from endoprior_baselines.surgicalgaussian import (
+    METHOD,
+    TimeNetwork,
+    covariances,
+    distance_change,
+    encoded,
+    neighbor_terms,
+    ssim,
+    state_shapes,
+)
 
 CFG = preset("surgicalgaussian")
 
@@ -201,6 +209,7 @@ def test_growth_removal_and_resets():
 # All together.
 
 
+@pytest.mark.slow
 def test_it_trains_resumes_with_equal_bits_and_comes_back(tiny_sequence, tmp_path):
     changes = {"density.start_iteration": 2, "density.every": 3, "schedule.sh_every": 3}
     cfg = preset("surgicalgaussian", iterations=8, **changes)

@@ -76,7 +76,7 @@ def test_relaxation_evaluates_eight_times(monkeypatch):
 def test_only_candidates_count_for_the_relaxation():
     """Gaussians that were never observed have score 1 in `released`; they take no part, so they relax nothing."""
     rng = np.random.default_rng(5)
-    score, eligible = rng.beta(2, 8, 3000), rng.random(3000) < 0.5
+    score, eligible = rng.beta(2, 8, 2200), rng.random(2200) < 0.5
     score[~eligible] = 1
     cfg = preset("released").temporal
     chosen, weights = temporal.choose(score, eligible, cfg, True)

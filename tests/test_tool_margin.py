@@ -257,6 +257,7 @@ def test_their_colors_do_not_matter(make_tiny_sequence):
     assert all(torch.equal(one[name], other[name]) for name in ("means", "opacity_logits", "sh_dc"))
 
 
+@pytest.mark.slow
 def test_a_run_records_the_margin_and_scores_use_the_masks_as_they_are(tiny_sequence, tmp_path):
     sequence, run = clip(tiny_sequence, 140), tmp_path / "run"
     scene = train(sequence, CFG, run, progress=False)

@@ -13,12 +13,12 @@ from endoprior.core.checks import InputError
 from endoprior.data.images import read_color, read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.tool_masks import FoundTools, ToolFinder, network
-from endoprior.tool_masks.finder import network_size
 from endoprior.tool_masks.network import (
     LONG_SIDE_PX,
     ToolNetwork,
     network_from,
     network_input,
+    network_size,
     shipped_network,
     weights_of,
 )

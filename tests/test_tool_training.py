@@ -55,7 +55,9 @@ def tube(rng, scene, view):
     return ribbed_tube(rng, scene)[1]
 
 
-@pytest.mark.parametrize("paint", [instrument, gauze, tube, needle])
+@pytest.mark.parametrize(
+    "paint", [instrument, tube, *(pytest.param(each, marks=pytest.mark.slow) for each in (gauze, needle))]
+)
 def test_bodies_are_painted_inside_of_what_they_cover(paint):
     shares = []
     for seed in range(12):
@@ -110,6 +112,7 @@ def test_beyond_the_view_nothing_of_the_scene_is_seen(seed):
     assert (dark != light).any() and (dark == light)[far].all()
 
 
+@pytest.mark.slow
 def test_some_borders_are_not_told_and_what_is_beyond_them_is_no_tool():
     told, untold = 0, 0
     for seed in range(60):

@@ -97,6 +97,7 @@ def test_children_keep_the_track_of_their_parent():
     assert grown.coefficients is tracks.coefficients
 
 
+@pytest.mark.slow
 def test_training_is_held_to_the_tracks(tiny_sequence):
     """With a great weight motion stays nearer to where it started than without the term."""
     distance = {}

@@ -42,7 +42,7 @@ def test_twenty_steps_reproduce_the_stored_losses(tiny_sequence, kind):
     assert len({r[1] for r in rows}) > 1, "no Gaussian was added or removed: density control was not exercised"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["basis", pytest.param("hexplane", marks=pytest.mark.slow)])
 def test_equal_seeds_give_equal_bits_and_others_do_not(tiny_sequence, tmp_path, kind):
     sequence = load_sequence(tiny_sequence)
     cfg = tiny_config(kind)
@@ -53,7 +53,7 @@ def test_equal_seeds_give_equal_bits_and_others_do_not(tiny_sequence, tmp_path, 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("stop_after", [3, 6, 13])
+@pytest.mark.parametrize("stop_after", [6, *(pytest.param(after, marks=pytest.mark.slow) for after in (3, 13))])
 def test_stop_and_resume_equals_uninterrupted(tiny_sequence, tmp_path, kind, stop_after):
     sequence, cfg = load_sequence(tiny_sequence), tiny_config(kind)
     train(sequence, cfg, tmp_path / "whole")

@@ -104,16 +104,15 @@ def test_tiny_turns_are_not_lost_in_rounding():
 
 
 @pytest.mark.parametrize("with_scale", [False, True])
-@pytest.mark.parametrize("seed", range(3))
-def test_alignment_is_the_least_squares_one(with_scale, seed):
-    true, estimated = random_path(seed), moved(noisy(random_path(seed)), seed + 7, 0.4 if with_scale else 1.0)
+def test_alignment_is_the_least_squares_one(with_scale):
+    true, estimated = random_path(0), moved(noisy(random_path(0)), 7, 0.4 if with_scale else 1.0)
 
     def residuals(x):
         scale = np.exp(x[6]) if with_scale else 1.0
         placed = [scale * Rotation.from_rotvec(x[:3]).as_matrix() @ p[:3, 3] + x[3:6] for p in estimated]
         return np.concatenate([a - q[:3, 3] for a, q in zip(placed, true, strict=True)])
 
-    starts = Rotation.random(6, random_state=seed).as_rotvec()
+    starts = Rotation.random(6, random_state=0).as_rotvec()
     slow = min((least_squares(residuals, [*r, 0, 0, 0, 0], x_scale="jac") for r in starts), key=lambda fit: fit.cost)
     errors = trajectory_errors(estimated, true, with_scale)
     assert errors.ate_mm == pytest.approx(np.sqrt(2 * slow.cost / len(true)), rel=1e-6)

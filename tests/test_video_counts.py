@@ -84,7 +84,7 @@ def cut_off(file, folder, share):
     return folder / file.name
 
 
-@pytest.mark.parametrize("share", [0.5, 0.9])
+@pytest.mark.parametrize("share", [pytest.param(0.5, marks=pytest.mark.slow), 0.9])
 @pytest.mark.parametrize("name", INTACT)
 def test_a_file_cut_off_in_the_middle_is_rejected(clips, tmp_path, name, share):
     if (name, share) == ("clock_of_600.avi", 0.9):

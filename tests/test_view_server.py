@@ -175,6 +175,7 @@ def test_a_track_fades_where_a_tool_hides_its_point_or_where_it_is_uncertain(sce
     assert not tracks.lines(4, False).dots.any(), "not certain there any more"
 
 
+@pytest.mark.slow
 def test_every_quantity_is_measured_and_saved_as_a_table(viewer, client):
     client.set(viewer.panel.measure, True)
     client.set(viewer.panel.quantity, AREA)
@@ -231,6 +232,7 @@ def test_each_gaussian_has_a_color_also_behind_the_camera(scene):
     assert len(cloud.colors) == len(cloud.points) == len(scene)
 
 
+@pytest.mark.slow
 def test_play_advances_and_pauses(viewer, client):
     client.set(viewer.panel.speed, "0.5x")
     client.set(viewer.panel.play, True)
@@ -257,6 +259,7 @@ def test_a_browser_can_render_the_gaussians_itself(viewer, client):
     demand(viewer.panel.layer, LAYER_NAMES["depth"], "BackgroundImageMessage")  # no color of a Gaussian
 
 
+@pytest.mark.slow
 def test_screenshot_and_video_are_stored_in_the_run(viewer, client):
     client.set(viewer.panel.screenshot, True)
     client.set(viewer.panel.camera, ORBIT)
@@ -274,6 +277,7 @@ def test_the_server_binds_to_this_machine_only(viewer):
     assert viewer.server.get_host() == "127.0.0.1" and viewer.server.request_share_url() is None
 
 
+@pytest.mark.slow
 def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
     sequence = load_sequence(tiny_sequence)
     viewable = ViewableSequence(sequence)

@@ -7,7 +7,8 @@ differs from the release, and why, is in docs/methods.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -23,12 +24,10 @@ from endoprior.initialization.sampling import PointCloud, concatenated, has_surf
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Field, Motion, Offsets
 from endoprior.model.ops import ModelOps
-from endoprior.model.presets import paper
-from endoprior.training.gaussian_method import GaussianMethod
 from endoprior.training.optimizer import Rate, rate_of
 
 from .learned_basis import COEFFICIENTS, value_at
-from .surface_points import enough, surface_points
+from .surface_points import Released, enough, surface_points
 
 NUM_BASES = 17
 """Basis functions of each Gaussian and channel."""
@@ -81,30 +80,18 @@ class LearnedBasisMotion(Motion):
         return Offsets(**dict(zip(CHANNELS, parts, strict=True)))
 
 
-class Deform3DGS(GaussianMethod):
+class Deform3DGS(Released):
     """See `GaussianMethod`."""
 
-    uses_prior = False
     color_is_error = True
     first_share = SHARE
     clone_extent = 0.0  # what grows is split
-    _motion = LearnedBasisMotion()
-
-    def config(self) -> Config:
-        """What its preset starts from. The rates are those of 3DGS: the defaults."""
-        return paper().replace(
-            {
-                "method": "deform3dgs",
-                "loss.tv_weight": 0.0,
-                "temporal.weight": 0.0,
-                "density.min_densify_weight": 1.0,
-                "schedule.coarse_iterations": 0,
-            }
-        )
-
-    @override
-    def motion(self, cfg: Config) -> Motion:
-        return self._motion
+    name = "deform3dgs"
+    way = LearnedBasisMotion()
+    changes: ClassVar[Mapping[str, Any]] = {  # the rates are those of 3DGS: the defaults
+        "loss.tv_weight": 0.0,
+        "schedule.coarse_iterations": 0,
+    }
 
     @override
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:

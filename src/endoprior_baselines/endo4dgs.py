@@ -5,8 +5,9 @@ As released. What differs from the release, and why, is in docs/methods.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,11 +20,9 @@ from endoprior.core.types import Frame, RenderOutput, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.model.gaussians import SH_C0, Gaussians
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
-from endoprior.model.motion import Motion
-from endoprior.model.presets import paper
 from endoprior.render.projection import rotation_matrices
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
-from endoprior.training.gaussian_method import GaussianMethod, in_epochs
+from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate, rate_of
@@ -31,7 +30,7 @@ from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
-from .surface_points import grid_points
+from .surface_points import Released, grid_points
 
 EVERY_PX = 2
 """A point starts at every second pixel along both axes; the release takes all, a quarter of a million."""
@@ -60,32 +59,20 @@ class SmallMotion(HexPlaneMotion):
     field_class = SmallField
 
 
-class Endo4DGS(GaussianMethod):
+class Endo4DGS(Released):
     """See `GaussianMethod`."""
 
-    uses_prior = False
     first_share = 1 / EVERY_PX**2
-    _motion = SmallMotion()
-
-    def config(self) -> Config:
-        """What its preset starts from."""
-        return paper().replace(
-            {
-                "method": "endo4dgs",
-                "deformation.hexplane.time_resolution": 75,
-                "deformation.hexplane.channels": 32,
-                "deformation.hexplane.multires": (1, 2),
-                "temporal.weight": 0.0,
-                "density.stop_iteration": 1500,
-                "density.min_densify_weight": 1.0,
-                "optim.decay_iterations": 20_000,
-                "schedule.sh_every": 1000,
-            }
-        )
-
-    @override
-    def motion(self, cfg: Config) -> Motion:
-        return self._motion
+    name = "endo4dgs"
+    way = SmallMotion()
+    changes: ClassVar[Mapping[str, Any]] = {
+        "deformation.hexplane.time_resolution": 75,
+        "deformation.hexplane.channels": 32,
+        "deformation.hexplane.multires": (1, 2),
+        "density.stop_iteration": 1500,
+        "optim.decay_iterations": 20_000,
+        "schedule.sh_every": 1000,
+    }
 
     @override
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:

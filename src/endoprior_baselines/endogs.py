@@ -8,7 +8,9 @@ left out.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -21,12 +23,11 @@ from endoprior.core.config import Config
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion, LinearLayers, num_features
-from endoprior.model.motion import Field, Motion, Offsets
+from endoprior.model.motion import Field, Offsets
 from endoprior.model.ops import ModelOps
-from endoprior.model.presets import paper
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.frames import TrainingFrames
-from endoprior.training.gaussian_method import GaussianMethod, in_epochs
+from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
@@ -34,6 +35,7 @@ from endoprior.training.step import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
+from .surface_points import Released
 
 UNIT_MM = 10.0
 """Unit of length of what the network gives. COLMAP's, which is any; with this one a scene 10 cm wide has the extent 5
@@ -109,34 +111,22 @@ class JointMotion(HexPlaneMotion):
         return replace(found, sh_rest=found.sh_rest[:, : gaussians["sh_rest"].shape[1]])
 
 
-class EndoGS(GaussianMethod):
+class EndoGS(Released):
     """See `GaussianMethod`."""
 
     background = (1.0, 1.0, 1.0)
-    uses_prior = False
     keeps_optimizer = True
-    _motion = JointMotion()
-
-    def config(self) -> Config:
-        """What its preset starts from. Published: 3,000 and 60,000 iterations."""
-        return paper().replace(
-            {
-                "method": "endogs",
-                "init.sampler": "pool",
-                "deformation.hexplane.time_resolution": 75,
-                "deformation.hexplane.channels": 32,
-                "temporal.weight": 0.0,
-                "density.stop_iteration": 45_000,
-                "density.min_densify_weight": 1.0,
-                "optim.decay_iterations": 1_000_000,
-                "schedule.fine_iterations": 5000,
-                "schedule.sh_every": 1000,
-            }
-        )
-
-    @override
-    def motion(self, cfg: Config) -> Motion:
-        return self._motion
+    name = "endogs"
+    way = JointMotion()
+    changes: ClassVar[Mapping[str, Any]] = {  # published: 3,000 and 60,000 iterations
+        "init.sampler": "pool",
+        "deformation.hexplane.time_resolution": 75,
+        "deformation.hexplane.channels": 32,
+        "density.stop_iteration": 45_000,
+        "optim.decay_iterations": 1_000_000,
+        "schedule.fine_iterations": 5000,
+        "schedule.sh_every": 1000,
+    }
 
     @override
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:

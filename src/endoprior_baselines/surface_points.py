@@ -1,16 +1,42 @@
-"""Points on the surface that frames show, which methods start from."""
+"""What the released methods share: how their configs are made, and points on the surface that frames show."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from endoprior.core.checks import input_error
+from endoprior.core.config import Config
 from endoprior.core.geometry import back_project
 from endoprior.core.types import Frame
 from endoprior.initialization.sampling import MIN_POINTS, PointCloud, concatenated, has_surface
+from endoprior.model.motion import Motion
+from endoprior.model.presets import paper
+from endoprior.training.gaussian_method import GaussianMethod
+
+
+class Released(GaussianMethod):
+    """A method as its authors released it: without the texture prior and the temporal term."""
+
+    uses_prior = False
+    name: ClassVar[str]
+    changes: ClassVar[Mapping[str, Any]]
+    """What its preset changes in `paper` besides."""
+    way: ClassVar[Motion]
+    """How its Gaussians move."""
+
+    def config(self) -> Config:
+        """What its preset starts from."""
+        common = {"method": self.name, "temporal.weight": 0.0, "density.min_densify_weight": 1.0}
+        return paper().replace(common | dict(self.changes))
+
+    @override
+    def motion(self, cfg: Config) -> Motion:
+        return self.way
 
 
 def grid_points(frames: Sequence[Frame], every_px: int, first_px: int) -> PointCloud:

@@ -28,8 +28,8 @@ from endoprior.model.scene import RenderedScene, Scene
 from endoprior.model.scene_file import load_scene
 from endoprior.priors import joint_texture_prior, specular_likelihood
 from endoprior.system.atomic import whole_file
-from endoprior.visualization.camera_paths import tissue_distance, turned
 from endoprior.visualization.image_tools import colorize, label, tile, to_u8, write_png
+from endoprior.visualization.rendered_views import tissue_distance, turned
 
 from .matrix import Matrix, frames_of
 from .results import Results

@@ -16,7 +16,6 @@ from endoprior.system.atomic import write_json, write_text
 
 from .figures import GRIDS, budget_figure, curve_figure, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
-from .published import published_blocks, published_table
 from .results import Results
 from .spec import ClaimSpec
 from .statistics import Difference
@@ -29,6 +28,8 @@ from .tables import (
     protocol_blocks,
     protocol_tables,
     protocol_values,
+    published_blocks,
+    published_table,
     score_table,
 )
 

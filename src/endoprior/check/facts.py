@@ -26,10 +26,9 @@ from ..footage.border import Circle, Outline, Strips, find_outline, masked_borde
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
 from ..footage.overlays import find_static_overlays, without_strokes
-from ..footage.polarity import Polarity, mask_polarity
 from ..footage.pose_fit import PoseFit, View, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
-from ..footage.units import FAR_MM, UnitGuess, guess_unit
+from ..footage.units import FAR_MM, Polarity, UnitGuess, guess_unit, mask_polarity
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
 

@@ -56,7 +56,7 @@ class Masks(Command):
             other = "--refine" if self.refine else "--with"
             raise input_error("--tool", f"no {other}", other, f"find the tools with {other} first, without --tool.")
         from ..data import load_sequence
-        from ..data.folder_edits import writable_masks
+        from ..data.writer import writable_masks
 
         sequence = load_sequence(self.data)
         writable_masks(sequence)
@@ -68,8 +68,8 @@ class Masks(Command):
 
     def _find_all(self, sequence: FrameSequence) -> None:
         """Find the tools of every frame, by our own means or by a segmenter that they prompt."""
-        from ..data.folder_edits import note_found_masks
         from ..data.found_tools import FrameRow, uncertain_frames, write_rows
+        from ..data.writer import note_found_masks
         from ..prepare.networks import open_sam2
         from ..tool_masks.sequence import find_in_sequence
         from ..tool_masks.video_segmenter import segment_sequence
@@ -120,7 +120,7 @@ def _replacing(
     sequence: FrameSequence, also_shown: Set[int] = frozenset()
 ) -> Iterator[tuple[Callable[..., None], Path, Counting]]:
     """Yield what takes the mask of a frame, a folder to work in, and the progress; then write masks and sheet."""
-    from ..data.folder_edits import replace_masks
+    from ..data.writer import replace_masks
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import mask_sheet, write_png
 

@@ -80,8 +80,7 @@ class Render(Command):
         """Render the scene of `run` and print the output paths."""
         from ..model.highlights import without_highlights
         from ..system.atomic import removed_on_failure
-        from ..visualization.camera_paths import read_path, sway_path, times_path
-        from ..visualization.rendered_views import depth_span, write_views
+        from ..visualization.rendered_views import depth_span, read_path, sway_path, times_path, write_views
         from ..visualization.tissue_layers import SupportMap, write_support_film, write_texture_film
 
         run, frames = folder_of(self.run), None

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..core.config import DataConfig
 from ..core.ranges import spread
 from ..core.types import Camera
-from ..footage.outside import find_outside
+from ..footage.border import find_outside
 from .assemble import Pixels, assemble, kept_frames
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..core.config import DataConfig
 from ..core.types import Camera, Frame
-from ..footage.right_view import right_frame
+from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes
-from .contents import demand_same, fingerprint_of, remarks_on, state_of
+from .contents import demand_same, fingerprint_of, remarks_on, state_of, weighted
 from .description import ESTIMATED_POSES, TOOLS_FOUND
-from .reliability import weighted
 from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]

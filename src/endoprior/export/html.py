@@ -23,7 +23,7 @@ import json
 import math
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -32,10 +32,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..core.checks import InputError, input_error
 from ..core.geometry import length_unit
 from ..core.types import Camera, Splats
+from ..model.photometric import GRID
 from ..model.playback import faded
 from ..model.scene import Scene, Shown
 from ..render.constants import ALPHA_MIN, NEAR_Z
@@ -147,12 +149,14 @@ def _too_large(out: Path, max_bytes: int, num_bytes: float, num_times: int, num_
 
 
 def _about(scene: Scene, times: list[float]) -> dict[str, Any]:
-    """What the page knows of the sequence, for JSON."""
+    """What the page knows of the sequence, for JSON; its smoke as `most` and `texels`, see `_packed_smoke`."""
     cameras = [scene.camera_at(time) for time in times]
     rows = [[c.fx, c.fy, c.cx, c.cy, *c.world_to_camera.ravel().tolist()] for c in cameras]
     if np.ptp(rows, axis=0).max() == 0:
         rows = rows[:1]
-    return {
+    grids = [scene.smoke_at(time) for time in times]
+    smoke = {"smoke": _packed_smoke(grids)} if any(grid is not None for grid in grids) else {}
+    return smoke | {
         "format": DATA_FORMAT,
         "width": cameras[0].width,
         "height": cameras[0].height,
@@ -160,6 +164,18 @@ def _about(scene: Scene, times: list[float]) -> dict[str, Any]:
         "background": list(scene.background),
         "seconds": [time * len(scene.cameras) / scene.frames_per_second for time in times],
     }
+
+
+def _packed_smoke(grids: Sequence[Tensor | None]) -> dict[str, Any]:
+    """Size of the grids of smoke, largest value, and in Base64 the root of each as a share of its own, 0..255.
+
+    A root is off by half a level of color at most. Time steps without smoke let all light through.
+    """
+    clear = torch.zeros((*GRID, 2)).index_fill_(2, torch.tensor([0]), 1.0)
+    roots = torch.stack([clear if grid is None else grid for grid in grids]).sqrt()
+    most = float(roots.max())
+    texels = (roots * (255 / most)).round().to(torch.uint8).numpy().tobytes()
+    return {"size": roots.shape[1:3], "most": most, "texels": base64.b64encode(texels).decode()}
 
 
 def _page(title: str, remark: str, unit: str, about: dict[str, Any], data: bytes) -> str:

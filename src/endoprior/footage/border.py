@@ -1,20 +1,156 @@
-"""Where the endoscope image ends: strips at the sides, a circle, and borders of any other shape. Images are K samples
-of the clip, (H, W, 3), at different times.
+"""Where the endoscope image ends: strips at the sides, a circle, and borders of any other shape.
+
+What lies outside is dark in nearly all samples of the clip, at the edge of the image, and begins sharply. The level
+that separates it is the one at which the outline is sharpest. Endoscope images are convex: a dark part that cuts into
+the image is tissue or a tool, unless it is long and flat, and sharp too. Of several images in a frame the largest is
+taken. `K` samples (H, W, 3) of one clip, at different times.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask
-from .dark_outline import Circle, brightness
-from .outside import Outside, find_outside
+from .components import AREA, Image, Mask, components, disk, distance_inside, grown, regions_where, square
+from .dark_outline import Circle, Darkness, blurred, brightness, find_darkness, reduced
 from .round_border import find_circle
+
+IN_SAMPLES = 0.9  # The outside is dark in this share of the samples; glare reaches over a border now and then
+MOST_LEVEL = 20  # Median level of what can be outside
+LEVEL_STEP, MOST_SHARE = 1.25, 0.5  # Factor between levels that are tried; the last is this share of the usual level
+REACH = 0.006  # Length within which a sharp outline becomes bright, in sides of the image ...
+LEAST_REACH_PX = 3
+RATIO, MOST_OF = 2.5, 0.5  # ... by this factor at least, and to this share of the level further inside
+LEAST_PICTURE, LEAST_OUTSIDE = 0.05, 0.001  # Shares of the frame: of the endoscope image, and of one part outside
+SHARP, ALIKE = 0.6, 0.02  # Least sharp share of an outline, and by how much less is as good as the best
+FLAT = 3.0  # A part outside that cuts into the image is so many times longer along its edge than deep
+FADED, MOST_RIM = 0.8, 4  # The rim has less than this share of the level deeper inside; its largest width, in reaches
+CERTAIN = 0.9  # Below this sharp share of its outline, a border is uncertain
+MOVES = 0.002  # A border moves if it hides this share of the frame in half of the samples
+ANOTHER = 0.1  # Another image in the frame has at least this share of the area of the largest
+
+
+@dataclass(frozen=True)
+class Outside:
+    """What of a frame is not the endoscope image."""
+
+    mask: Mask  # (H, W)
+    sharpness: float = 1.0  # share 0..1 of the outline that is sharp; below `CERTAIN` the border is uncertain
+    level: float = 0.0  # brightness 0..255 that it does not exceed
+    images: int = 1  # number of images in the frame, of which the largest is taken
+    moves: bool = False  # whether single samples show less: see `beyond`
+
+
+def find_outside(images: Sequence[Image], inside: Mask | None = None) -> Outside:
+    """Detect what shows nothing, at the edge or outside of a known border.
+
+    Args:
+        images: K samples (H, W, 3) of one size.
+        inside: (H, W) True inside of a border that is known already; None for all.
+    """
+    grays = [blurred(brightness(image)) for image in images]
+    inside = np.ones(grays[0].shape, bool) if inside is None else inside
+    darkness = find_darkness(reduced(grays)[0])
+    if darkness is None or darkness.level >= MOST_LEVEL or not inside.any():
+        return Outside(np.zeros_like(inside))
+    rank = int(IN_SAMPLES * (len(grays) - 1))
+    usual = np.partition(np.stack(grays), rank, axis=0)[rank]
+    small = reduced([usual])[0][0]
+    size = small.shape[::-1]
+    view = cv2.resize(inside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    tried = [_cut(small, level, darkness, view) for level in _levels(small, darkness)]
+    best = max(cut.sharpness for cut in tried)
+    alike = [cut.level for cut in tried if cut.mask.any() and cut.sharpness >= best - ALIKE]
+    if not alike:
+        return Outside(np.zeros_like(inside))
+    found = _cut(usual, alike[len(alike) // 2], darkness, inside)
+    found = replace(found, mask=grown(found.mask, disk(_rim(usual, found.mask, inside))) & inside)
+    moved = [beyond(image, found.level, inside & ~found.mask).mean() for image in images]
+    return replace(found, moves=float(np.median(moved)) > MOVES)
+
+
+def beyond(image: Image, level: float, inside: Mask) -> Mask:
+    """(H, W) True where one image (H, W, 3) shows nothing though others do there: the border moves, as in a video of a
+    screen.
+
+    Args:
+        level: of `Outside`.
+        inside: (H, W) True where the clip shows something.
+    """
+    found = _cut(blurred(brightness(image)), level, Darkness(0.0, level / 4), inside).mask
+    return grown(found, square(LEAST_REACH_PX)) & inside if found.any() else found
+
+
+def _levels(usual: Image, darkness: Darkness) -> list[float]:
+    """Levels that may separate the outside, ascending."""
+    first = darkness.level + darkness.step
+    lit = usual[usual > first]
+    last = max(MOST_SHARE * float(np.median(lit)) if lit.size else 0.0, first)
+    return [first * LEVEL_STEP**i for i in range(int(np.log(last / first) / np.log(LEVEL_STEP)) + 1)]
+
+
+def _cut(gray: Image, level: float, darkness: Darkness, inside: Mask) -> Outside:
+    """What is outside if only what is brighter than `level` shows something."""
+    reach = _reach(gray)
+    core = cv2.morphologyEx(((gray > level) & inside).astype(np.uint8), cv2.MORPH_OPEN, disk(reach)) > 0
+    regions, boxes = components(core, 4)
+    areas = boxes[1:, AREA]
+    if not areas.size or areas.max() < LEAST_PICTURE * gray.size:
+        return Outside(np.zeros_like(inside), 0.0, level)
+    picture = regions == 1 + int(areas.argmax())
+    hull = np.zeros(gray.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(picture)[:, ::-1].astype(np.int32)), 1)
+    convex = (hull > 0) & inside
+    low, high = (change(gray, square(reach)).astype(np.float32) for change in (cv2.erode, cv2.dilate))
+    beside = cv2.dilate(cv2.blur(gray, (2 * reach + 1,) * 2), square(3 * reach))
+    sharp = high >= np.maximum(np.maximum(RATIO * low, low + 4 * darkness.step), MOST_OF * beside)
+    around, notch = inside & ~convex, convex & ~picture
+    distance = distance_inside(np.pad(convex, 1))[1:-1, 1:-1]  # the edge of the image counts
+    cut, cut_line, cut_clear = _parts(around, around & grown(convex, square(1)), sharp)
+    edge = notch & grown(picture, square(1)) & (distance > reach)
+    notches, line, clear = _parts(notch, edge, sharp, distance)
+    others = int((areas >= ANOTHER * areas.max()).sum())
+    return Outside(cut | notches, (cut_clear + clear) / max(cut_line + line, 1), level, others)
+
+
+def _parts(
+    dark: Mask, outline: Mask, sharp: Mask, distance: NDArray[np.float32] | None = None
+) -> tuple[Mask, int, int]:
+    """The parts of `dark` that are outside, and the length of their outline and of its sharp part, px. Those that cut
+    into the image have a distance to its convex outline, px.
+    """
+    regions, boxes = components(dark, 4)
+    count = len(boxes)
+    line, clear = (np.bincount(regions[where], minlength=count) for where in (outline, outline & sharp))
+    chosen = (boxes[:, AREA] >= LEAST_OUTSIDE * dark.size) & (line > 0) & (clear >= SHARP * line)
+    if distance is not None:
+        depth = np.zeros(count, np.float32)
+        np.maximum.at(depth, regions[dark], distance[dark])
+        chosen &= np.bincount(regions[dark & (distance < 1.5)], minlength=count) > FLAT * depth
+    chosen[0] = False
+    return regions_where(chosen, regions), int(line[chosen].sum()), int(clear[chosen].sum())
+
+
+def _reach(gray: Image) -> int:
+    return max(LEAST_REACH_PX, round(REACH * max(gray.shape)))
+
+
+def _rim(usual: Image, outside: Mask, inside: Mask) -> int:
+    """Width of the darkened or blurred rim next to the outside, px."""
+    reach = _reach(usual)
+    distance = distance_inside(~outside)
+    deep = usual[(distance > MOST_RIM * reach) & (distance < 2 * MOST_RIM * reach) & inside]
+    level = float(np.median(deep)) if deep.size else 0.0
+    for width in range(1, MOST_RIM * reach):
+        ring = usual[(distance >= width) & (distance < width + 1) & inside]
+        if not ring.size or np.median(ring) >= FADED * level:
+            return width
+    return reach
+
 
 __all__ = ["Circle", "Outline", "Outside", "Strips", "find_circle", "find_outline", "find_strips", "masked_border"]
 

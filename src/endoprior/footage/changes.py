@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .components import Image, Mask, runs
-from .disturbances import disturbances
-from .frame_quality import measure_quality, small_size
-from .same_view import View, same_view
+from .disturbances import disturbances, measure_quality, small_size
+from .scenes import THUMB_WIDTH as SCENE_WIDTH
+from .scenes import View, change, jumps, same_view, standardized
 
 THUMB_WIDTH = 160  # Images are compared at this width, px
 SAME_LEVELS = 0.03  # Images with a smaller mean difference, in levels of 255, are duplicates
@@ -28,7 +28,6 @@ JUMP = 0.13  # Smallest exposure jump: change of the logarithm of brightness (14
 JUMP_RATIO = 6.0  # An exposure jump is this many times the usual change of brightness ...
 JUMP_AGREEMENT = 0.85
 """... and this share of the image changes in the same direction. A tool that enters darkens only a part."""
-CUT_CORRELATION = 0.4  # Successive images of one scene have a higher correlation
 ACROSS = (1, 3, 6)  # Tissue is looked for in images so far before and after what looks like a cut
 BLUR_RATIO = 0.45  # An image is blurred if its sharpness is below this share of that of its neighbors
 NEIGHBORS = 5  # Number of images on each side that define the usual value
@@ -73,7 +72,8 @@ def find_changes(images: Iterable[Image]) -> Changes:
         qualities.append(measure_quality(np.asarray(small, np.uint8), np.ones(small.shape[:2], bool)))
     pairs, sharp = list(pairwise(thumbs)), np.array(sharpness)
     difference = np.array([np.abs(now - before).mean() for before, now in pairs], np.float64)
-    cuts = tuple(i for i, pair in enumerate(pairs, 1) if _correlation(*pair) < CUT_CORRELATION and _is_cut(thumbs, i))
+    seconds = np.arange(len(thumbs)) / USUAL_RATE
+    cuts = tuple(i for i in np.flatnonzero(jumps(seconds, _steps(thumbs))).tolist() if _is_cut(thumbs, i))
     scene = np.isin(np.arange(len(thumbs)), cuts).cumsum()
     off_color = np.abs(shares - np.median(shares, axis=0)).max(1) > COLOR_DISTANCE
     return Changes(
@@ -85,7 +85,7 @@ def find_changes(images: Iterable[Image]) -> Changes:
         cuts=cuts,
         blurred=_places(sharp < BLUR_RATIO * np.array([np.median(window) for window in _windows(sharp)])),
         off_color=_places(_of_other_scenes(off_color, thumbs)),
-        weights=disturbances(np.arange(len(thumbs)) / USUAL_RATE, qualities, scene)[1],
+        weights=disturbances(seconds, qualities, scene)[1],
     )
 
 
@@ -153,6 +153,13 @@ def _of_other_scenes(off_color: Mask, thumbs: Sequence[NDArray]) -> Mask:
         edges = [i for i in (first, end) if 0 < i < len(thumbs)]
         found[first:end] = all(_correlation(thumbs[i - 1], thumbs[i]) < FOLLOWS for i in edges)
     return found
+
+
+def _steps(thumbs: Sequence[NDArray]) -> NDArray[np.float64]:
+    """(T,) `change` of each image from the one before."""
+    size = SCENE_WIDTH, max(round(SCENE_WIDTH * thumbs[0].shape[0] / thumbs[0].shape[1]), 1)
+    small = [standardized(cv2.resize(thumb, size, interpolation=cv2.INTER_AREA)) for thumb in thumbs]
+    return np.array([0.0, *(change(before, now) for before, now in pairwise(small))])
 
 
 def _is_cut(thumbs: Sequence[NDArray], first: int) -> bool:

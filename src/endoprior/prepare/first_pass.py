@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..core.shell import quoted
 from ..data.reading import kind_of
-from ..footage.border import Circle, Outside, Strips, find_outline
+from ..footage.border import CERTAIN as SHARP
+from ..footage.border import Circle, Outside, Strips, beyond, find_outline
 from ..footage.changes import are_combed
-from ..footage.outside import CERTAIN as SHARP
-from ..footage.outside import beyond
 from ..footage.overlays import find_static_overlays, find_strokes, without_strokes
 from ..footage.round_border import CERTAIN
 from .calibration import fitted

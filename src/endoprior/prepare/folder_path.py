@@ -14,9 +14,9 @@ from ..core.checks import input_error
 from ..data.description import ESTIMATED_POSES, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
 from ..data.files import list_files
-from ..data.folder_edits import POSES, demand_writable, depth_bounds, pose_table, replace_depth, replace_poses
 from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
+from ..data.writer import POSES, demand_writable, depth_bounds, pose_table, replace_depth, replace_poses
 from ..footage.changes import find_changes
 from ..system.atomic import write_json
 from .camera_path.sequence_path import AS_OURS, ASSUMED, PATH_RECORD, Reading, path_depth, sequence_path

@@ -20,14 +20,13 @@ from ..core.config import DataConfig
 from ..core.ranges import spread
 from ..data import load_sequence
 from ..data.description import TOOLS_FOUND
-from ..data.folder_edits import found_source, write_mask
 from ..data.found_tools import FoundTools, FrameRow, write_rows
 from ..data.frame_files import match_files, match_names
 from ..data.images import DEPTH_SUFFIXES, read_color, read_depth_file, read_stored, read_values, save_png
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import open_mask_folder
 from ..data.pixels import is_measured
-from ..data.writer import TOOL_VALUE, FrameFiles
+from ..data.writer import TOOL_VALUE, FrameFiles, found_source, write_mask
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit

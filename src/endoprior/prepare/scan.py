@@ -12,10 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..footage.components import runs
-from ..footage.disturbances import disturbances, scenes_outside
-from ..footage.frame_quality import FrameQuality, measure_quality, small_size, view_mask
-from ..footage.same_view import Link, View, feature_link, flow_link
-from ..footage.scenes import THUMB_WIDTH, breaks, change, connected, jumps, standardized
+from ..footage.disturbances import FrameQuality, disturbances, measure_quality, scenes_outside, small_size, view_mask
+from ..footage.scenes import (
+    THUMB_WIDTH,
+    Link,
+    View,
+    breaks,
+    change,
+    connected,
+    feature_link,
+    flow_link,
+    jumps,
+    standardized,
+)
 from .source import Source, open_source, quick_images
 
 LOOKS, RATES = 2400, (2.0, 10.0)

@@ -30,6 +30,9 @@ SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0  # size and standard deviation of the
 SMOOTHING_STEP_PX = 0.5  # ... and the difference of disparity between neighbors on different surfaces, px
 SPECKLE_STEP_PX = 1.0  # neighbors whose disparities differ by more belong to different regions
 PLANE_RESIDUAL_PX = 0.35  # a hole is filled if 90 % of its rim lies on a plane to within this, px of disparity
+BLOCK_PX, LEFT_RIGHT_PX = 7, 1.0  # side of the matching blocks, and tolerance of the left-right consistency check
+SPECKLE_PX, FILL_PX = 150, 400  # isolated regions of fewer pixels are removed, holes of at most so many are filled
+MIN_CONFIDENCE = 0.1  # depth of lower confidence is removed
 
 Image = NDArray[np.uint8]
 
@@ -42,29 +45,12 @@ class StereoConfig:
     """Smallest depth of the search, mm, 1..10000; a smaller value takes more time."""
     far_mm: float = 300.0
     """Largest depth of the search, mm, at most 100000."""
-    block_px: int = 7
-    """Side of the matching blocks, px, odd, 3..15: larger is smoother."""
-    left_right_px: float = 1.0
-    """Tolerance of the left-right consistency check, px, 0.1..10."""
-    speckle_px: int = 150
-    """Isolated regions of fewer pixels are removed, 0..1000000."""
-    fill_px: int = 400
-    """Holes of at most this many pixels in a smooth surface are filled, 0..1000000."""
-    min_confidence: float = 0.1
-    """Depth of lower confidence is removed, 0..1."""
 
     def __post_init__(self) -> None:
         check_range("near_mm", self.near_mm, 1, 1e4)
         check_range("far_mm", self.far_mm, 1, 1e5)
         if not self.near_mm < self.far_mm:
             raise ValueError(f"far_mm must be more than near_mm, got {self.far_mm:g} and {self.near_mm:g}")
-        if self.block_px % 2 == 0:
-            raise ValueError(f"block_px must be odd, got {self.block_px}")
-        check_range("block_px", self.block_px, 3, 15)
-        check_range("left_right_px", self.left_right_px, 0.1, 10)
-        check_range("speckle_px", self.speckle_px, 0, 1_000_000)
-        check_range("fill_px", self.fill_px, 0, 1_000_000)
-        check_range("min_confidence", self.min_confidence, 0, 1)
 
 
 def stereo_depth(
@@ -92,13 +78,13 @@ def stereo_depth(
             f"focal_px {focal_px:g}, baseline_mm {baseline_mm:g} and images {width} px wide, got {cfg.far_mm:g}"
         )
     left, right = (cv2.cvtColor(camera, cv2.COLOR_RGB2GRAY) for camera in (left_u8, right_u8))
-    disparity, apart = _match_consistently(left, right, lowest, highest, cfg)
+    disparity, apart = _match_consistently(left, right, lowest, highest)
     # Smooth first: the refinement shifts whole windows and would keep the matcher's steps inside them.
     disparity, texture = refine_disparity(left, right, smooth_disparity(disparity))
     glint = specular_likelihood(left_u8 * np.float32(1 / 255))
-    confidence = texture * np.exp(-((apart / np.float32(cfg.left_right_px)) ** 2)) * (1 - glint / 2)
-    disparity[~(confidence >= cfg.min_confidence)] = np.nan
-    disparity = fill_small_holes(smooth_disparity(drop_speckles(disparity, cfg.speckle_px)), cfg.fill_px)
+    confidence = texture * np.exp(-((apart / np.float32(LEFT_RIGHT_PX)) ** 2)) * (1 - glint / 2)
+    disparity[~(confidence >= MIN_CONFIDENCE)] = np.nan
+    disparity = fill_small_holes(smooth_disparity(drop_speckles(disparity, SPECKLE_PX)), FILL_PX)
     # This comparison also excludes NaN and disparities of the wrong sign.
     valid = (disparity >= lowest) & (disparity <= product / cfg.near_mm)
     return np.divide(product, disparity, out=np.zeros_like(disparity), where=valid)
@@ -136,9 +122,7 @@ def temporal_median(window: Sequence[NDArray]) -> NDArray:
     return result
 
 
-def _match_consistently(
-    left: NDArray, right: NDArray, lowest: float, highest: float, cfg: StereoConfig
-) -> tuple[NDArray, NDArray]:
+def _match_consistently(left: NDArray, right: NDArray, lowest: float, highest: float) -> tuple[NDArray, NDArray]:
     """(H, W) disparity of the left image, NaN where the consistency check fails; (H, W) left-right difference, px."""
     height, width = left.shape
     times = -(-width // MATCHING_WIDTH)
@@ -147,9 +131,9 @@ def _match_consistently(
     if times > 1:
         left, right = (cv2.resize(camera, size, interpolation=cv2.INTER_AREA) for camera in (left, right))
     bounds = int(np.floor(lowest / scale)), int(np.ceil(highest / scale))
-    from_left, from_right = match_both_ways(left, right, *bounds, cfg.block_px)
+    from_left, from_right = match_both_ways(left, right, *bounds, BLOCK_PX)
     apart = disagreement(from_left, from_right)
-    from_left[apart > cfg.left_right_px] = np.nan
+    from_left[apart > LEFT_RIGHT_PX] = np.nan
     if times == 1:
         return from_left, apart
     from_left, apart = (

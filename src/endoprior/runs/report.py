@@ -17,9 +17,8 @@ from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
-from ..visualization.camera_paths import tissue_distance, turned
 from ..visualization.image_tools import colorize, to_u8
-from ..visualization.rendered_views import depth_span
+from ..visualization.rendered_views import depth_span, tissue_distance, turned
 from ..visualization.tissue_layers import PaintedTissue, SupportMap
 from .folder import LOG
 from .log import LOG_EVERY, read_log

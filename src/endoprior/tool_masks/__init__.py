@@ -1,6 +1,6 @@
 """Find surgical tools in the frames of a clip, with a small network that comes with the program."""
 
 from ..data.found_tools import FoundTools
-from .finder import ToolFinder
+from .network import ToolFinder
 
 __all__ = ["FoundTools", "ToolFinder"]

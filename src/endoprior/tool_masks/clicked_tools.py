@@ -18,7 +18,7 @@ from ..core.ranges import spread
 from ..data import FrameSequence
 from ..footage.components import Mask, large_regions
 from .examples import Examples, clicked_region, examples_of, feature_map, fit, probability
-from .finder import ToolFinder, full_size, network_image, small_view
+from .network import ToolFinder, full_size, network_image, small_view
 from .regions import tool_regions
 from .sequence import SAMPLES, view_of
 

@@ -2,7 +2,8 @@
 
 It sees one frame, so it needs neither motion nor a second frame; `h, w` is the size of the image that it gets, whose
 longer side is `LONG_SIDE_PX`. Its weights are a file in the package, checked against its digest; docs/tool_network.md
-says how they were made.
+says how they were made. Nothing is fitted to a clip: a tool that rests is found as well as one that moves. `H, W` is
+the size of the whole image. The masks are a starting point: correct them in the viewer, or pass your own.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,8 +21,10 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.checks import input_error
+from ..core.checks import check_shape, input_error
+from ..data.found_tools import FoundTools
 from ..footage.components import Image, Mask
+from .regions import tool_regions
 
 FILE = Path(__file__).with_name("tool_network.safetensors")
 SHA256 = "c49c792f112e198d4a1d206bd207df48166d957f0cd12afebde312d891b96c9c"
@@ -133,3 +137,63 @@ def weights_of(network: ToolNetwork) -> bytes:
     """The bytes of a weights file: every weight in float16, without counters."""
     state = network.state_dict()
     return save({name: value.half().contiguous() for name, value in state.items() if value.is_floating_point()})
+
+
+MAYBE = 0.25  # Pixels of a higher probability may be a tool: they count in the confidence
+LEAST_DOUBT = 0.004  # Share of the view in doubt from which on a frame without a mask is uncertain
+
+
+class ToolFinder:
+    """Finds the tools of single frames."""
+
+    def __init__(self, network: ToolNetwork | None = None) -> None:
+        """Take a network in place of the one that comes with the program."""
+        self._network = network or shipped_network()
+
+    def log_odds(self, rgb_u8: Image, view: Mask, mirrored: bool = True) -> NDArray[np.float32]:
+        """(h, w) log-odds of a tool of a frame (H, W, 3) in the view (H, W). `mirrored`: mean over the frame and its
+        three mirror images, which is steadier and takes four times as long.
+        """
+        image = torch.from_numpy(network_image(rgb_u8, view))
+        h, w = image.shape[1:]
+        flips = ((), (-1,), (-2,), (-1, -2)) if mirrored else ((),)
+        images = torch.stack([image.flip(flip) for flip in flips])
+        images = torch.nn.functional.pad(images, (0, -w % MULTIPLE, 0, -h % MULTIPLE))
+        with torch.inference_mode():
+            found = self._network(images.contiguous(memory_format=torch.channels_last))[:, :h, :w]
+        return torch.stack([one.flip(flip) for one, flip in zip(found, flips, strict=True)]).mean(0).numpy()
+
+    def find(self, rgb_u8: Image, view: Mask) -> FoundTools:
+        """Find the tools of one frame; arguments as in `log_odds`."""
+        if not view.any():
+            return FoundTools(np.zeros_like(view), 1.0)
+        probability = 1 / (1 + np.exp(-self.log_odds(rgb_u8, view)))
+        small = small_view(view)
+        mask = tool_regions(probability * small, small)
+        maybe = probability[(mask | (probability > MAYBE)) & small]
+        enough = mask.any() or maybe.size > LEAST_DOUBT * small.sum()
+        confidence = float(np.abs(2 * maybe - 1).mean()) if enough else 1.0
+        return FoundTools(full_size(mask, view.shape) & view, confidence)
+
+
+def network_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """(w, h) of the network's image for frames of (H, W)."""
+    scale = LONG_SIDE_PX / max(shape)
+    return max(1, round(shape[1] * scale)), max(1, round(shape[0] * scale))
+
+
+def network_image(rgb_u8: Image, view: Mask) -> NDArray[np.float32]:
+    """(6, h, w) what the network sees of a frame; arguments as in `ToolFinder.log_odds`."""
+    check_shape("rgb_u8:H,W,3 view:H,W", rgb_u8=rgb_u8, view=view)
+    small = cv2.resize(rgb_u8, network_size(view.shape), interpolation=cv2.INTER_AREA)
+    return network_input(np.asarray(small, np.uint8), small_view(view))
+
+
+def small_view(view: Mask) -> Mask:
+    """(h, w) of the view (H, W)."""
+    return cv2.resize(view.astype(np.uint8), network_size(view.shape), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def full_size(mask: Mask, shape: tuple[int, ...]) -> Mask:
+    """(H, W) of a mask (h, w)."""
+    return cv2.resize(mask.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5

@@ -12,7 +12,7 @@ from ..data import FrameSequence
 from ..data.found_tools import FoundTools
 from ..footage.border import find_outline, masked_border
 from ..footage.components import Mask, components, regions_where
-from .finder import ToolFinder
+from .network import ToolFinder
 
 SAMPLES = 16  # Number of frames from which the border of the view is taken
 Progress = Callable[[str, int, int], None]

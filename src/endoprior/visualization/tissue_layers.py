@@ -22,9 +22,8 @@ from ..model.gaussians import with_colors
 from ..model.scene import Scene
 from ..model.surface import FramesOf, Support, project_visible, render_surface
 from ..system.atomic import whole_file
-from .camera_paths import View
 from .image_tools import SOLID_ALPHA, label, to_u8
-from .rendered_views import file_stem, write_film
+from .rendered_views import View, file_stem, write_film
 
 SQUARES, STRIPES = 40, 80
 """Squares of the grid and stripes of the hatching along the width of the image: 16 px and 8 px of 640."""

@@ -18,8 +18,19 @@ from endoprior.compute.relu_network import relu_network
 from .field import RadianceField, RayBatch, normal, uniform
 from .layers import Linear, encoded, encoded_size, layers_of, start
 from .presets import RadianceConfig
-from .rays import RayFrames, Rays, to_perspective
-from .sampling import Composited, by_weight, centers, composited, density_alpha, even, jittered, weights_of
+from .rays import (
+    Composited,
+    RayFrames,
+    Rays,
+    by_weight,
+    centers,
+    composited,
+    density_alpha,
+    even,
+    jittered,
+    to_perspective,
+    weights_of,
+)
 
 LOW, HIGH = 3.0, 99.9
 """Percentiles of depth whose difference is the unit of u."""

@@ -24,8 +24,18 @@ from endoprior.core.geometry import back_project, pixel_centers
 from .endosurf_networks import SHARPNESS, ColorNetwork, DeformationNetwork, SurfaceNetwork
 from .field import RadianceField, RayBatch, uniform
 from .presets import RadianceConfig
-from .rays import RayFrames, Rays
-from .sampling import Composited, by_weight, centers, composited, even, sphere_ends, surface_alpha, surface_places
+from .rays import (
+    Composited,
+    RayFrames,
+    Rays,
+    by_weight,
+    centers,
+    composited,
+    even,
+    sphere_ends,
+    surface_alpha,
+    surface_places,
+)
 
 ROUNDS = 4
 """Rounds in which samples are added where the surface seems to be, ..."""

@@ -13,8 +13,7 @@ from torch import Generator, Tensor, nn
 from endoprior.system.arrays_file import ArraySpec
 
 from .presets import RadianceConfig
-from .rays import RayFrames, Rays
-from .sampling import Composited
+from .rays import Composited, RayFrames, Rays
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 Behind the tool and from the sides the truth is that of a phantom; from cameras beside the endoscope only tissue that
 it sees in the same frame counts (`phantom/side_views.py`). The right eye of a stereo endoscope has pictures of its own,
-which no method trains on; there only tissue that both eyes see counts, by measured depth (`footage/right_view.py`), and
-the left picture, moved to the right eye by that depth, is scored beside the scene.
+which no method trains on; there only tissue that both eyes see counts, by measured depth (`footage/stereo_order.py`),
+and the left picture, moved to the right eye by that depth, is scored beside the scene.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from ...core.geometry import expected_depth
-from ...footage.right_view import measured_disparity, right_camera, warp_to_right
+from ...footage.stereo_order import measured_disparity, right_camera, warp_to_right
 from ..context import EvaluationContext
 from ..score import scores_from
 from .depth import depth_rmse

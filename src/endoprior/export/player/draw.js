@@ -58,6 +58,11 @@ class Painter {
     this.rows = Math.ceil(about.gaussians / GAUSSIANS_PER_ROW);
     this.texels = new Uint16Array(this.rows * GAUSSIANS_PER_ROW * GAUSSIAN_TEXELS * 4);
     this.gaussians = this.texture(gl.RGBA16UI, GAUSSIANS_PER_ROW * GAUSSIAN_TEXELS, this.rows);
+    this.smokeSize = about.smoke ? about.smoke.size : [1, 1];
+    this.smoke = this.texture(gl.RG16F, this.smokeSize[1], this.smokeSize[0]);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+    this.smokeTexels = about.smoke ? bytesOfBase64(about.smoke.texels) : null;
     this.uploaded = -1;
     this.fence = null;
     this.sum = null;
@@ -98,11 +103,21 @@ class Painter {
     }
     gl.bindTexture(gl.TEXTURE_2D, this.gaussians);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, GAUSSIANS_PER_ROW * GAUSSIAN_TEXELS, this.rows, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, texels);
+    if (this.smokeTexels) this.uploadSmoke(frame);
     this.uploaded = frame;
   }
 
-  // parts: as `Blocks.parts` gives them for that frame; order: indices far to near; depth: show depth, not color
-  draw(frame, parts, order, view, depth) {
+  uploadSmoke(frame) {
+    const { gl } = this;
+    const [rows, columns] = this.smokeSize;
+    const roots = this.smokeTexels.subarray(2 * rows * columns * frame, 2 * rows * columns * (frame + 1));
+    const values = Float32Array.from(roots, (root) => ((root * this.about.smoke.most) / 255) ** 2);
+    gl.bindTexture(gl.TEXTURE_2D, this.smoke);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, columns, rows, gl.RG, gl.FLOAT, values);
+  }
+
+  // parts: as `Blocks.parts` gives them for that frame; order: indices far to near; depth: show depth, not color; smoke: show it
+  draw(frame, parts, order, view, depth, smoke) {
     const { gl } = this;
     if (gl.isContextLost()) return;
     this.resizeSum();
@@ -129,6 +144,11 @@ class Painter {
     gl.uniform1i(this.screen.places.depth, depth ? 1 : 0);
     gl.uniform3fv(this.screen.places.background, this.about.background);
     gl.uniform3fv(this.screen.places.ramp, DEPTH_COLORS.flat().map((v) => v / 255));
+    gl.uniform1i(this.screen.places.smoky, smoke ? 1 : 0);
+    gl.uniform1i(this.screen.places.smoke, 2);
+    gl.activeTexture(gl.TEXTURE2);
+    gl.bindTexture(gl.TEXTURE_2D, this.smoke);
+    gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.sum);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);

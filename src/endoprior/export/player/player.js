@@ -13,7 +13,7 @@ const stage = byId("stage");
 const canvas = byId("picture");
 const about = JSON.parse(byId("about").textContent);
 const numFrames = about.seconds.length;
-const state = { frame: 0, clock: 0, playing: false, speed: 1, loop: true, free: false, depth: false, base: 0 };
+const state = { frame: 0, clock: 0, playing: false, speed: 1, loop: true, free: false, depth: false, smoke: false, base: 0 };
 const hand = new FreeCamera();
 const swaying = new FreeCamera(); // until the first touch
 let swayedFor = window.matchMedia("(prefers-reduced-motion: reduce)").matches ? Infinity : 0; // s
@@ -68,16 +68,17 @@ function freeBase() {
 function requestPicture(share) {
   stale = false;
   const { free, depth, frame } = state;
+  const smoke = state.smoke && !free; // only the endoscope saw it
   const recorded = free ? freeBase() : recordedView(about, frame);
   const beside = swayedFor < Infinity ? swaying.view(recorded, recorded.size) : recorded;
   const view = free ? hand.view(recorded, fit().size) : beside;
-  sorter.ask({ frame, parts: blocks.parts(frame), nearZ: NEAR_Z, view, depth, share }).catch(failWith);
+  sorter.ask({ frame, parts: blocks.parts(frame), nearZ: NEAR_Z, view, depth, smoke, share }).catch(failWith);
 }
 
 // Called by the sorter with the order and its request.
-function drawAnswer(order, { frame, parts, view, depth, share }) {
+function drawAnswer(order, { frame, parts, view, depth, smoke, share }) {
   layOut(share);
-  painter.draw(frame, parts, order, view, depth);
+  painter.draw(frame, parts, order, view, depth, smoke);
   drawnQuality = share;
   canvas.dataset.frame = frame;
   canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
@@ -161,6 +162,7 @@ function setFree(free) {
   byId("endoscope").setAttribute("aria-pressed", !free);
   byId("free").setAttribute("aria-pressed", free);
   byId("reset").disabled = !free;
+  byId("smoke").disabled = free;
   changed();
 }
 
@@ -168,6 +170,12 @@ function setDepth(depth) {
   state.depth = depth;
   byId("depth").setAttribute("aria-pressed", depth);
   byId("scale").hidden = !depth;
+  changed();
+}
+
+function setSmoke(smoke) {
+  state.smoke = smoke;
+  byId("smoke").setAttribute("aria-pressed", smoke);
   changed();
 }
 
@@ -230,6 +238,7 @@ const KEYS = {
   e: () => setFree(false),
   f: () => setFree(true),
   d: () => setDepth(!state.depth),
+  s: () => about.smoke && !state.free && setSmoke(!state.smoke),
   l: () => setLoop(!state.loop),
   r: () => hand.reset(),
   "+": () => zoom(0.9),
@@ -279,6 +288,7 @@ function connect() {
     endoscope: () => setFree(false),
     free: () => setFree(true),
     depth: () => setDepth(!state.depth),
+    smoke: () => setSmoke(!state.smoke),
     reset: () => { hand.reset(); changed(); },
   };
   for (const [id, act] of Object.entries(clicks)) {
@@ -311,6 +321,7 @@ function describe() {
   const size = `${about.width} × ${about.height} px`;
   const frames = numFrames === 1 ? "1 frame" : `${numFrames} frames`;
   byId("facts").textContent = `${about.gaussians.toLocaleString("en")} Gaussians · ${size} · ${frames}`;
+  byId("smoke").hidden = !about.smoke;
   const [near, far] = about.depth_range;
   byId("scale-near").textContent = near.toFixed(0);
   byId("scale-far").textContent = far.toFixed(0);

@@ -118,13 +118,18 @@ precision highp float;
 precision highp sampler2D;
 uniform sampler2D drawn;
 uniform bool depth;
+uniform sampler2D smoke;   // gain and veil: see model/photometric.py
+uniform bool smoky;
 uniform vec3 background;
 uniform vec3 ramp[${DEPTH_COLORS.length}];
 out vec4 shown;
 void main() {
   vec4 sum = texelFetch(drawn, ivec2(gl_FragCoord.xy), 0);
   if (!depth) {
-    shown = vec4(sum.rgb + (1.0 - sum.a) * background, 1.0);
+    vec3 color = sum.rgb + (1.0 - sum.a) * background;
+    vec2 at = gl_FragCoord.xy / vec2(textureSize(drawn, 0)), veil = texture(smoke, vec2(at.x, 1.0 - at.y)).rg;
+    if (smoky) color = sqrt(veil.r * max(color, 0.0) * max(color, 0.0) + veil.g);
+    shown = vec4(color, 1.0);
     return;
   }
   float at = clamp(sum.r / max(sum.a, 1e-4), 0.0, 1.0) * float(${DEPTH_COLORS.length - 1});
