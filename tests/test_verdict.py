@@ -84,6 +84,18 @@ def test_followed_points_triangulate_to_the_plane():
     assert np.median(np.abs(z / true - 1)[told]) < 0.02
 
 
+def test_points_of_the_border_are_not_followed_where_the_scene_moves():
+    def with_border(clip: Clip) -> Clip:
+        border = np.random.default_rng(0).integers(0, 255, (HEIGHT, 40, 3)).astype(np.uint8)
+        for k, frame in enumerate(clip.frames_):
+            clip.frames_[k] = replace(frame, rgb_u8=np.concatenate([border, frame.rgb_u8[:, 40:]], 1))
+        return clip
+
+    moving, resting = (with_border(Clip(step_mm=step)) for step in (2.0, 0.0))
+    assert (follow(resting, 0, 12).start[:, 0] < 30).sum() > 20, "without motion, they are as good as others"
+    assert not (follow(moving, 0, 6).start[:, 0] < 30).any() and len(follow(moving, 0, 6).start) > 30
+
+
 def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
     camera = Clip(2).camera(0)
     pixels = np.array([[20.0, 30.0], [90.0, 60.0]])

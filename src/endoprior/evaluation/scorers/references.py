@@ -16,8 +16,9 @@ from ...core.geometry import back_project, project
 from ...core.ranges import spread
 from ...core.types import Camera, Frame
 from ...data import FrameList, FrameSequence
+from ...footage.alignment import align
 from ...footage.components import Mask
-from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_both_ways, gray_for_flow
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_both_ways, gray_for_flow, stuck
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
@@ -151,7 +152,11 @@ class Followed:
 
 
 def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
-    """Points of a grid on the tissue of a frame, followed from frame to frame for `ahead` frames."""
+    """Points of a grid on the tissue of a frame, followed from frame to frame for `ahead` frames.
+
+    Points that stay while the image as a whole moves are of the border or of fibers. The images say so, not the poses,
+    which are judged by these points.
+    """
     frame = sequence.frame(first)
     height, width = frame.tissue_mask.shape
     step = width / GRID
@@ -161,11 +166,14 @@ def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
     kept = shown_pixels(now + HALF, frame.tissue_mask)
     tried = int(kept.sum())
     for index in range(first + 1, first + ahead + 1):
-        frame = sequence.frame(index)
+        before, frame = frame, sequence.frame(index)
         following = gray_for_flow(frame.rgb_u8, 1)
-        now, returned = follow_both_ways(gray, following, now, RETURN_PX)
-        kept &= returned & shown_pixels(now + HALF, frame.tissue_mask)
-        gray = following
+        there, returned = follow_both_ways(gray, following, now, RETURN_PX)
+        step = align(gray, following, before.tissue_mask, frame.tissue_mask)
+        if step is not None:
+            returned &= ~stuck(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)
+        kept &= returned & shown_pixels(there + HALF, frame.tissue_mask)
+        gray, now = following, there
     return Followed(start[kept] + HALF, now[kept] + HALF, tried)
 
 
