@@ -167,7 +167,8 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
     missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
     is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
-    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative, is_unknown)
+    codes = tuple(finding["code"] for finding in read_json(job.findings)["findings"])
+    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative, is_unknown, codes)
     result.verdict = verdict_on(result.scores, facts)
     result.save(job.run)
     title = [PREVIEW_TITLE] * job.is_preview + wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)

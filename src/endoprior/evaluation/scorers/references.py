@@ -35,6 +35,8 @@ SCORES = scores_from("""
         Median distance, after 12 frames, between where the scene and where chained flow carries tissue; 640 px wide.
     depth_triangulated_error | depth against triangulation |  | lower | 3 | relative | depth | -
         Median relative difference between rendered depth and that of points triangulated with the scene's cameras.
+    depth_relief | depth relief against triangulation |  | higher | 2 | relative | depth | -
+        Correlation, within a frame, of the logarithms of rendered and triangulated depth; flat depth has none.
 """)
 MEAN_FRAMES = 60  # training frames in the mean image
 STARTS, AHEAD, GRID = 6, 12, 16
@@ -47,6 +49,8 @@ MOST_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, ar
 LEAST_POINTS, LEAST_SHARE = 40, 0.1
 """Least number of points that a score rests on, and their share of all that lie on tissue: a few beside a dark tube do
 not speak for its depth."""
+RELIEF_POINTS, LEAST_RELIEF = 100, 0.03
+"""Least number of points that tell the relief, and the median by which the logarithm of their depth must differ."""
 FEW_POINTS = "too few points could be followed on tissue"
 STANDS = "the camera stands still"
 
@@ -55,7 +59,7 @@ def compute(context: EvaluationContext) -> None:
     """Compare rendered frames of the split, carried points and depth with what the video says."""
     with context.skip_if_unavailable("gain_over_flow", "gain_over_mean"):
         _image_references(context)
-    with context.skip_if_unavailable("slip_px", "depth_triangulated_error"):
+    with context.skip_if_unavailable("slip_px", "depth_triangulated_error", "depth_relief"):
         _point_references(context, context.scene)
 
 
@@ -114,7 +118,7 @@ def moved_frame(training: FrameList, frame: Frame) -> tuple[NDArray[np.float32],
 def _point_references(context: EvaluationContext, scene: Scene) -> None:
     sequence = context.sequence
     ahead = min(AHEAD, len(sequence) - 1)
-    slips, errors, tried = list[NDArray](), list[NDArray](), 0
+    slips, errors, reliefs, tried = list[NDArray](), list[NDArray](), list[NDArray](), 0
     for k in spread(len(sequence) - ahead, STARTS):
         followed = follow(sequence, k, ahead)
         tried += followed.tried
@@ -133,6 +137,9 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
         slips.append(gap[seen])
         true, told = triangulated(start, end, camera, last)
         errors.append(np.abs(true[told] / depth[told] - 1))
+        if told.any():
+            logs = np.log([true[told], depth[told]])
+            reliefs.append(logs - np.median(logs, 1, keepdims=True))
     for name, values, why in (
         ("slip_px", slips, FEW_POINTS),
         ("depth_triangulated_error", errors, f"{STANDS}, or {FEW_POINTS}"),
@@ -140,6 +147,17 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
         found = np.concatenate(values) if values else np.zeros(0)
         enough = len(found) >= max(LEAST_POINTS, LEAST_SHARE * tried)
         context.add(name, float(np.median(found)) if enough else math.nan, why)
+    relief = relief_agreement(np.concatenate(reliefs, 1) if reliefs else np.zeros((2, 0)), LEAST_SHARE * tried)
+    context.add("depth_relief", relief, f"{STANDS}, the tissue is flat, or {FEW_POINTS}")
+
+
+def relief_agreement(relief: NDArray[np.floating], least: float = 0) -> float:
+    """Correlation of true and rendered relief (2, P), of `least` points or more; NaN where the true one is not seen."""
+    relief = relief[:, np.abs(relief[0]) < 1]  # beyond, rays met by chance
+    if relief.shape[1] < max(RELIEF_POINTS, least) or np.median(np.abs(relief[0])) < LEAST_RELIEF:
+        return math.nan
+    true, told = relief - relief.mean(1, keepdims=True)
+    return float((true * told).sum() / max(float(np.sqrt((true**2).sum() * (told**2).sum())), 1e-12))
 
 
 @dataclass(frozen=True)
