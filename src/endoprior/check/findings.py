@@ -267,11 +267,13 @@ def _changes(facts: Facts) -> Iterator[Finding]:
     if odd:
         reasons = "blurred, covered or outside the body" + (", damaged, or without a camera pose" if marked else "")
         what = f"{reasons}: {_frames(odd)}"
+        fix = _skip(facts, odd)
         if len(marked) == facts.frames:
-            what += "; these are all, so that a model would be trained on them as if they had poses"
+            what += "; these are all, so that training uses them as if each had a pose"
+            fix = "use another part of the video, or more frames per second"
         elif marked and facts.data.reliability == "used":
             what += f"; neither trained on nor scored are {_frames(tuple(marked))}"
-        yield Finding("unexplained-frames", "warning", what, _skip(facts, odd), odd)
+        yield Finding("unexplained-frames", "warning", what, fix, odd)
 
 
 def _video(facts: Facts) -> Iterator[Finding]:
