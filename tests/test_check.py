@@ -354,6 +354,18 @@ def test_blurred_frames_and_few_frames(data):
     assert found["unexplained-frames"].frames == (4,)
 
 
+def test_where_no_frame_has_a_pose_nothing_is_said_to_be_left_out(facts):
+    moving = replace(facts.motion, path_px=facts.motion.path_px + 99)
+    described = facts.described | {"unexplained_frames": list(range(facts.frames))}
+    lost = replace(facts, described=described, sources={"camera motion": "unknown"}, motion=moving)
+    found = {finding.code: finding for finding in find(lost)}
+    assert (
+        "as if each had a pose" in found["unexplained-frames"].what
+        and "another part" in found["unexplained-frames"].fix
+    )
+    assert "how the camera moves is unknown" in found["camera-unknown"].what and "camera-moves" not in found
+
+
 def test_findings_from_edited_facts(facts):
     relative = find(replace(facts, depth=replace(facts.depth, relative=True)))
     assert [(f.code, f.severity) for f in relative] == [("relative-depth", "note")]

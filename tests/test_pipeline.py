@@ -17,12 +17,13 @@ from endoprior.cli.progress import step_head
 from endoprior.cli.run import Run, resume_words
 from endoprior.core.checks import InputError, quotation
 from endoprior.core.shell import command
+from endoprior.data import load_sequence
 from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline import STEPS, SequenceJob, make_job, notes_of, open_folder, problems, run_step, verdict_of
-from endoprior.pipeline.steps import PREVIEW_TITLE
+from endoprior.pipeline.steps import PREVIEW_TITLE, demand_known_motion
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.work_folder import work_lock
 from endoprior.system.atomic import write_json
@@ -67,6 +68,19 @@ def test_a_preview_does_without_colmap_unless_it_is_asked_for(asked, taken, vide
     assert job.prepare.poses == taken and job.options.get("--poses", ("auto",)) == (asked,)
     whole = make_job(video, tmp_path, PrepareConfig(poses=asked), preset("default"))
     assert whole.prepare.poses == asked
+
+
+def test_without_any_camera_there_is_no_training_unless_the_user_wants_that_part(video, done, tmp_path):
+    sequence = load_sequence(done.data)
+    every = list(range(len(sequence)))
+    demand_known_motion(done, sequence, every)  # static
+    sequence.sources["camera motion"] = "unknown"
+    demand_known_motion(done, sequence, every[1:])  # one camera serves the others
+    with pytest.raises(InputError, match=r"the camera moves is unknown.*_forced.* --start 0 --end 1\.08"):
+        demand_known_motion(done, sequence, every)
+    chosen = make_job(video, tmp_path, PrepareConfig(end=1.0), tiny_config("basis"))
+    demand_known_motion(chosen, sequence, every)
+    demand_known_motion(replace(done, options={"--segment": ("1",)}), sequence, every)
 
 
 def test_every_step_leaves_its_result(done):

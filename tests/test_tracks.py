@@ -244,3 +244,15 @@ def test_training_starts_along_the_tracks(tmp_path):
 def test_only_the_basis_can_start_along_tracks():
     with pytest.raises(InputError, match=r"init\.motion: expected rest with deformation\.kind hexplane[;,] got flow"):
         Config(deformation=DeformationConfig(kind="hexplane"))
+
+
+def test_what_stays_in_the_image_while_the_camera_moves_is_no_track():
+    frames = moving_frames((-4.0, 0.0), moving=slice(60, None))  # columns before that belong to the lens
+    for k, frame in enumerate(frames):
+        moved = np.eye(4)
+        moved[0, 3] = -4.0 * k * DEPTH / 200
+        frames[k] = replace(frame, camera=replace(frame.camera, world_to_camera=moved))
+    cloud = cloud_at([(30.5, 60.5), (130.5, 60.5)], 0, frames[0].camera)
+    lens, tissue = followed(frames, cloud).transpose(1, 0, 2)
+    assert np.isnan(lens[1:]).all()
+    np.testing.assert_allclose(tissue[:, 0], 130.5 - 4 * np.arange(NUM_FRAMES), atol=0.2)

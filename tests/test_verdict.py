@@ -9,7 +9,7 @@ from known_surface import NORMAL, OFFSET, pose, seen, turned
 from endoprior.cli.run import last_words
 from endoprior.core.types import Camera, Frame
 from endoprior.evaluation.scorers.image import psnr_tissue
-from endoprior.evaluation.scorers.references import follow, mean_image, moved_frame, triangulated
+from endoprior.evaluation.scorers.references import follow, mean_image, moved_frame, relief_agreement, triangulated
 from endoprior.evaluation.verdict import Facts, Verdict, verdict_on
 
 WIDTH, HEIGHT = 160, 128
@@ -84,6 +84,18 @@ def test_followed_points_triangulate_to_the_plane():
     assert np.median(np.abs(z / true - 1)[told]) < 0.02
 
 
+def test_points_of_the_border_are_not_followed_where_the_scene_moves():
+    def with_border(clip: Clip) -> Clip:
+        border = np.random.default_rng(0).integers(0, 255, (HEIGHT, 40, 3)).astype(np.uint8)
+        for k, frame in enumerate(clip.frames_):
+            clip.frames_[k] = replace(frame, rgb_u8=np.concatenate([border, frame.rgb_u8[:, 40:]], 1))
+        return clip
+
+    moving, resting = (with_border(Clip(step_mm=step)) for step in (2.0, 0.0))
+    assert (follow(resting, 0, 12).start[:, 0] < 30).sum() > 20, "without motion, they are as good as others"
+    assert not (follow(moving, 0, 6).start[:, 0] < 30).any() and len(follow(moving, 0, 6).start) > 30
+
+
 def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
     camera = Clip(2).camera(0)
     pixels = np.array([[20.0, 30.0], [90.0, 60.0]])
@@ -116,13 +128,32 @@ def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
         ({}, Facts(depth_is_relative=True), "usable", "a guess from one eye"),
         ({}, Facts(share_used=0.7), "usable", "70% of the frames"),
         ({}, Facts(share_used=0.3), "doubtful", "30% of the frames"),
-        ({}, Facts(share_with_missed_tools=0.2), "usable", "missed in 20%"),
+        ({}, Facts(share_with_missed_tools=0.08), "usable", "missed in 8%"),
+        ({}, Facts(share_with_missed_tools=0.17), "doubtful", "missed in 17%"),
         ({}, Facts(motion_is_unknown=True), "doubtful", "path is unknown"),
+        ({}, Facts(findings=("camera-moves",)), "doubtful", "say that it is static"),
+        ({}, Facts(findings=("depth-disparity",)), "doubtful", "near is far"),
+        ({"depth_triangulated_error": 0.1, "depth_relief": -0.05}, Facts(), "doubtful", "does not rise and fall"),
+        ({"depth_triangulated_error": 0.1, "depth_relief": 0.2}, Facts(), "good", "10% off"),
     ],
 )
 def test_the_worst_evidence_decides(changes, facts, word, reason):
     verdict = verdict_on(GOOD_SCORES | changes, facts)
     assert verdict.word == word and reason in verdict.reasons[0] + " ".join(verdict.reasons)
+
+
+def test_flat_and_inverted_depth_have_no_relief():
+    true = np.random.default_rng(0).normal(0, 0.1, 200)
+    measured = true + np.random.default_rng(1).normal(0, 0.1, 200)
+    sound, flat, inverted = (relief_agreement(np.stack([measured, told])) for told in (true, 0 * true, -true))
+    assert sound > 0.6 and flat == 0 and inverted < -0.6
+    assert np.isnan(relief_agreement(np.stack([measured, true])[:, :99])), "too few points"
+    assert np.isnan(relief_agreement(np.stack([0.01 * true, true]))), "the tissue is flat"
+
+
+def test_what_nothing_confirms_is_not_good():
+    verdict = verdict_on({name: value for name, value in GOOD_SCORES.items() if name != "slip_px"}, Facts())
+    assert verdict.word == "usable" and "too few points" in verdict.reasons[0]
 
 
 def test_without_a_held_out_frame_nothing_is_good():

@@ -16,7 +16,7 @@ from ..core.checks import number_ranges, quotation, read_ranges
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
 from ..core.shell import command
-from ..data.description import SIZE_NOT_STATED
+from ..data.description import MOTION, SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION
 from ..footage.units import FAR_MM
 from ..model.presets import preset
@@ -196,12 +196,14 @@ def _border(facts: Facts) -> Iterator[Finding]:
 
 
 def _motion(facts: Facts) -> Iterator[Finding]:
-    if facts.camera_is_fixed and facts.motion.kind == "unknown":
-        what = f"whether the camera moves is unknown, and it is static in the stored poses ({facts.motion.reason})"
+    is_unknown = facts.sources.get(MOTION) == "unknown"  # as `prepare` says, which has tried to find a path
+    if facts.camera_is_fixed and (is_unknown or facts.motion.kind == "unknown"):
+        how = "how the camera moves is unknown" if facts.motion.moving else "whether the camera moves is unknown"
+        what = f"{how}, and it is static in the stored poses ({facts.motion.reason})"
         yield Finding(
             "camera-unknown", "warning", what, "look at the video; use more frames per second, or a shorter part"
         )
-    if not (facts.motion.moving and facts.camera_is_fixed):
+    if is_unknown or not (facts.motion.moving and facts.camera_is_fixed):
         return
     beyond = np.flatnonzero(facts.motion.path_px > MOVING_FRACTION * facts.camera.width)
     first = int(beyond[0]) * facts.motion_step if len(beyond) else 0
@@ -265,9 +267,13 @@ def _changes(facts: Facts) -> Iterator[Finding]:
     if odd:
         reasons = "blurred, covered or outside the body" + (", damaged, or without a camera pose" if marked else "")
         what = f"{reasons}: {_frames(odd)}"
-        if marked and facts.data.reliability == "used":
+        fix = _skip(facts, odd)
+        if len(marked) == facts.frames:
+            what += "; these are all, so that training uses them as if each had a pose"
+            fix = "use another part of the video, or more frames per second"
+        elif marked and facts.data.reliability == "used":
             what += f"; neither trained on nor scored are {_frames(tuple(marked))}"
-        yield Finding("unexplained-frames", "warning", what, _skip(facts, odd), odd)
+        yield Finding("unexplained-frames", "warning", what, fix, odd)
 
 
 def _video(facts: Facts) -> Iterator[Finding]:

@@ -24,6 +24,7 @@ LEAST, MOST = 1e-6, 1e6  # range of every number in the file
 TOOLS_FOUND = "tools found"
 """Part of the source of masks that a program found: "tools found in 70% of the samples", "no tools found"."""
 OWN_POSES, COLMAP_POSES = "our own tracks", "COLMAP"
+MOTION = "camera motion"  # of `sources`: how the camera moves, or `unknown`
 ESTIMATED_POSES = (OWN_POSES, COLMAP_POSES)  # sources of poses that a program found in the video
 SIZE_NOT_STATED = "calibration, the size of its images not stated"
 """Source of a lens whose calibration file has no image size: the principal point decided."""

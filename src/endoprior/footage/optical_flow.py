@@ -19,6 +19,8 @@ MOTION_S = 0.1
 """Time between two frames that show how tissue moves, s: long enough for a breath to move it by a pixel."""
 HALVED_FROM_PX = 256
 """Flow of frames with at least this shorter side is computed at half size: four times faster, almost as accurate."""
+STUCK_PX, STUCK = 3.0, 0.3
+"""Where the image goes by the first or more, px at a width of 640, a point that goes less than this share is stuck."""
 FINE_SIDE_PX = 256  # Fine flow is computed on images shrunk by a whole number to at least this shorter side
 
 
@@ -66,6 +68,17 @@ def fine_flow(first: Image, second: Image, start: NDArray[np.float32] | None = N
 def _estimator() -> cv2.DISOpticalFlow:
     """A new one for each pair: it keeps buffers, and a result must not depend on the previous pair."""
     return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+
+def stuck(way: NDArray, expected: NDArray, width: int) -> Mask:
+    """(...) True where a point stays while the scene moves: flow saw the border, the lens or fibers, not tissue.
+
+    Args:
+        way: (..., 2) how far flow carries points; NaN is not stuck. expected: (..., 2) how far the scene goes, px.
+        width: of the image, px.
+    """
+    far, gone = np.linalg.norm(expected, axis=-1), np.linalg.norm(way, axis=-1)
+    return (far > STUCK_PX * width / 640) & (gone < STUCK * far)
 
 
 def follow_both_ways(

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from ..check import draw_check, find, measure
 from ..check.report import as_json
-from ..core.checks import quotation
+from ..core.checks import input_error, quotation
 from ..core.config import Config
-from ..core.shell import command
+from ..core.shell import command, command_of
 from ..data import FrameSequence, load_sequence
-from ..data.description import read_description
+from ..data.description import MOTION, read_description
 from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
@@ -30,7 +30,6 @@ from ..footage.components import runs
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
-from ..prepare.camera_path.tracks import MOTION
 from ..prepare.pipeline import Progress
 from ..prepare.scan_figure import draw_scan
 from ..runs.folder import CHECKPOINT, CONFIG
@@ -121,6 +120,7 @@ def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[st
         unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
         findings = read_json(job.findings)["findings"]
         cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
+        demand_known_motion(job, sequence, unexplained)
         usable = usable_frames(len(sequence), unexplained, cuts)
     first, end = usable
     if end - first < len(sequence):
@@ -131,6 +131,20 @@ def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[st
         notes = [f"note: training uses frames {first}-{end - 1}, the longest stretch: {why}"]
     begun = (job.run / CHECKPOINT).is_file() or (job.run / CONFIG).is_file()
     return start_run(sequence, cfg, job.run, resume=begun, say=lambda _text: None), notes
+
+
+def demand_known_motion(job: Job, sequence: FrameSequence, unexplained: list[int]) -> None:
+    """Raise InputError if no camera serves any frames, unless the user chose the part of the video."""
+    is_chosen = job.choice is None or "--segment" in job.options
+    if is_chosen or sequence.sources.get(MOTION) != "unknown" or len(unexplained) < len(sequence):
+        return
+    start, end = job.part.start, job.part.start + len(sequence) / job.part.frames_per_second
+    forced = {**job.options, "--start": (f"{start:.4g}",), "--end": (f"{end:.4g}",)}
+    again = command_of("run", (job.source, job.out.with_name(f"{job.out.name}_forced")), forced)
+    want = "frames that camera poses link, or in which the view rests"
+    got = f"neither in {start:.1f}-{end:.1f} s: how the camera moves is unknown, and no model is possible"
+    fix = "Choose another part (--segment, or --start and --end), or a higher --frames-per-second"
+    raise input_error(job.source, want, got, f"{fix}. To train on this part all the same: `{again}`.")
 
 
 def _train(job: SequenceJob, progress: Progress) -> list[str]:
@@ -153,7 +167,8 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
     missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
     is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
-    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative, is_unknown)
+    codes = tuple(finding["code"] for finding in read_json(job.findings)["findings"])
+    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative, is_unknown, codes)
     result.verdict = verdict_on(result.scores, facts)
     result.save(job.run)
     title = [PREVIEW_TITLE] * job.is_preview + wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)

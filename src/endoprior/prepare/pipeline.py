@@ -117,6 +117,8 @@ def prepare(
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
         others = sorted({*unexplained} - {*damaged})
+        if path is not None and path.is_unknown and not path.explained.any():
+            others = []  # the note on the motion says it
         notes = [*video_notes, *first_pass.notes, *methods.notes, *carried_notes, *motion_notes]
         notes += _advice(out, uncertain_frames(read_rows(folder)), moving, others, files.count - len(unexplained))
     return Prepared(out, files.count, first_pass.geometry.size, notes)

@@ -16,8 +16,9 @@ from ...core.geometry import back_project, project
 from ...core.ranges import spread
 from ...core.types import Camera, Frame
 from ...data import FrameList, FrameSequence
+from ...footage.alignment import align
 from ...footage.components import Mask
-from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_both_ways, gray_for_flow
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_both_ways, gray_for_flow, stuck
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
@@ -34,6 +35,8 @@ SCORES = scores_from("""
         Median distance, after 12 frames, between where the scene and where chained flow carries tissue; 640 px wide.
     depth_triangulated_error | depth against triangulation |  | lower | 3 | relative | depth | -
         Median relative difference between rendered depth and that of points triangulated with the scene's cameras.
+    depth_relief | depth relief against triangulation |  | higher | 2 | relative | depth | -
+        Correlation, within a frame, of the logarithms of rendered and triangulated depth; flat depth has none.
 """)
 MEAN_FRAMES = 60  # training frames in the mean image
 STARTS, AHEAD, GRID = 6, 12, 16
@@ -46,6 +49,8 @@ MOST_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, ar
 LEAST_POINTS, LEAST_SHARE = 40, 0.1
 """Least number of points that a score rests on, and their share of all that lie on tissue: a few beside a dark tube do
 not speak for its depth."""
+RELIEF_POINTS, LEAST_RELIEF = 100, 0.03
+"""Least number of points that tell the relief, and the median by which the logarithm of their depth must differ."""
 FEW_POINTS = "too few points could be followed on tissue"
 STANDS = "the camera stands still"
 
@@ -54,7 +59,7 @@ def compute(context: EvaluationContext) -> None:
     """Compare rendered frames of the split, carried points and depth with what the video says."""
     with context.skip_if_unavailable("gain_over_flow", "gain_over_mean"):
         _image_references(context)
-    with context.skip_if_unavailable("slip_px", "depth_triangulated_error"):
+    with context.skip_if_unavailable("slip_px", "depth_triangulated_error", "depth_relief"):
         _point_references(context, context.scene)
 
 
@@ -113,7 +118,7 @@ def moved_frame(training: FrameList, frame: Frame) -> tuple[NDArray[np.float32],
 def _point_references(context: EvaluationContext, scene: Scene) -> None:
     sequence = context.sequence
     ahead = min(AHEAD, len(sequence) - 1)
-    slips, errors, tried = list[NDArray](), list[NDArray](), 0
+    slips, errors, reliefs, tried = list[NDArray](), list[NDArray](), list[NDArray](), 0
     for k in spread(len(sequence) - ahead, STARTS):
         followed = follow(sequence, k, ahead)
         tried += followed.tried
@@ -132,6 +137,9 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
         slips.append(gap[seen])
         true, told = triangulated(start, end, camera, last)
         errors.append(np.abs(true[told] / depth[told] - 1))
+        if told.any():
+            logs = np.log([true[told], depth[told]])
+            reliefs.append(logs - np.median(logs, 1, keepdims=True))
     for name, values, why in (
         ("slip_px", slips, FEW_POINTS),
         ("depth_triangulated_error", errors, f"{STANDS}, or {FEW_POINTS}"),
@@ -139,6 +147,17 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
         found = np.concatenate(values) if values else np.zeros(0)
         enough = len(found) >= max(LEAST_POINTS, LEAST_SHARE * tried)
         context.add(name, float(np.median(found)) if enough else math.nan, why)
+    relief = relief_agreement(np.concatenate(reliefs, 1) if reliefs else np.zeros((2, 0)), LEAST_SHARE * tried)
+    context.add("depth_relief", relief, f"{STANDS}, the tissue is flat, or {FEW_POINTS}")
+
+
+def relief_agreement(relief: NDArray[np.floating], least: float = 0) -> float:
+    """Correlation of true and rendered relief (2, P), of `least` points or more; NaN where the true one is not seen."""
+    relief = relief[:, np.abs(relief[0]) < 1]  # beyond, rays met by chance
+    if relief.shape[1] < max(RELIEF_POINTS, least) or np.median(np.abs(relief[0])) < LEAST_RELIEF:
+        return math.nan
+    true, told = relief - relief.mean(1, keepdims=True)
+    return float((true * told).sum() / max(float(np.sqrt((true**2).sum() * (told**2).sum())), 1e-12))
 
 
 @dataclass(frozen=True)
@@ -151,7 +170,11 @@ class Followed:
 
 
 def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
-    """Points of a grid on the tissue of a frame, followed from frame to frame for `ahead` frames."""
+    """Points of a grid on the tissue of a frame, followed from frame to frame for `ahead` frames.
+
+    Points that stay while the image as a whole moves are of the border or of fibers. The images say so, not the poses,
+    which are judged by these points.
+    """
     frame = sequence.frame(first)
     height, width = frame.tissue_mask.shape
     step = width / GRID
@@ -161,11 +184,14 @@ def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
     kept = shown_pixels(now + HALF, frame.tissue_mask)
     tried = int(kept.sum())
     for index in range(first + 1, first + ahead + 1):
-        frame = sequence.frame(index)
+        before, frame = frame, sequence.frame(index)
         following = gray_for_flow(frame.rgb_u8, 1)
-        now, returned = follow_both_ways(gray, following, now, RETURN_PX)
-        kept &= returned & shown_pixels(now + HALF, frame.tissue_mask)
-        gray = following
+        there, returned = follow_both_ways(gray, following, now, RETURN_PX)
+        step = align(gray, following, before.tissue_mask, frame.tissue_mask)
+        if step is not None:
+            returned &= ~stuck(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)
+        kept &= returned & shown_pixels(there + HALF, frame.tissue_mask)
+        gray, now = following, there
     return Followed(start[kept] + HALF, now[kept] + HALF, tried)
 
 

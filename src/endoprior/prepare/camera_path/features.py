@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...footage.alignment import align
-from ...footage.optical_flow import follow_both_ways
+from ...footage.optical_flow import follow_both_ways, stuck
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
 from .tracks import Lens, PoseInput
@@ -29,8 +29,6 @@ COARSE_FLAT_WIDTHS, BLUR_WIDTHS = 28, 160
 """Where corners are few, detail between blurs of width / 160 and width / 28 px is followed: finer patterns of sensor or
 fibers stay where they are while the view moves."""
 GUESS_PX = 10.0  # parallax: a corner is this far from where the image as a whole goes, px of an image 640 px wide
-STUCK_PX, STUCK = 3.0, 0.3
-"""Where the image goes by the first or more, px at 640, a corner that goes less than this share belongs to the lens."""
 RETURN_PX = 1.0  # followed to the next frame and back, a corner returns within this distance
 KEYPOINTS = 600
 RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
@@ -133,9 +131,8 @@ def followed_directly(before: View, now: View, pixels: NDArray) -> tuple[NDArray
         criteria=FINE_CRITERIA,
     )
     px = now.flat.shape[1] / 640
-    far, gone = np.linalg.norm(guess - pixels, axis=1), np.linalg.norm(there - pixels, axis=1)
-    stuck = (far > STUCK_PX * px) & (gone < STUCK * far)
-    good &= ~stuck & (np.linalg.norm(there - guess, axis=1) < GUESS_PX * px) & (sampled(now.usable, there) > 0)
+    good &= ~stuck(there - pixels, guess - pixels, now.flat.shape[1])
+    good &= (np.linalg.norm(there - guess, axis=1) < GUESS_PX * px) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
     return kept, there[kept]
 

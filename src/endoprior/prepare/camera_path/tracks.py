@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...data.description import MOTION
 from .adjust import Observations, Resected, refined_pose
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from .shape import DepthShape
 
 REFINED = "refined with the camera path"  # where the focal length may come from: `sources.lens` of `sequence.json`
-MOTION = "camera motion"  # of `sources`: how the camera moves, or `unknown`
 HELD_OUT = 8  # one in this many tracks takes no part in any estimate: it measures how well a path explains the frames
 PIXEL_STD = 0.5  # error of a followed corner, px of an image 640 px wide
 KEYPOINT_STD = 1.0  # error of a matched keypoint, px of an image 640 px wide
