@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error, number_ranges
 from ...core.geometry import Convention, length_unit, to_ours
+from ...core.ranges import spread
 from ...core.shell import install_command
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import SHOWN, CameraMotion, camera_motion
@@ -26,8 +27,9 @@ from .follow import Follower, follow_camera
 from .kind import path_motion
 from .own import own_path
 from .pose_file import is_model, read_model_poses, read_poses
-from .shape import DepthShape, fitted_shape
+from .shape import DepthShape, axial_cosine, fitted_shape
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
+from .tube import shape_by_light
 
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
 NEGLIGIBLE_DEGREES = 1e-3
@@ -40,8 +42,10 @@ ONLY_IF_MOVING = ("auto", "auto-own")  # those that do so only where the camera 
 WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}  # the same, ten times faster
 FEWEST_POSED = 8  # frames; a shorter path is none
 SHAPINGS = 2
-"""Where the camera drives ahead, triangulated points fix the shape of relative depth, and the camera is followed again
-so often with the better depth."""
+"""Where the camera drives ahead, triangulated points or the light of a tube fix the shape of relative depth, and the
+camera is followed again so often with the better depth."""
+DRIVES = "forward", "backward", "translating"  # kinds of motion in which a tube is looked for
+LIT_FRAMES = 16  # number of frames that are asked for a tube
 UNKNOWN_POSES = "none: the motion of the camera is unknown"  # `sources.poses`
 Frame = Callable[[int], PoseInput]
 
@@ -209,12 +213,13 @@ def find_path(
 
     own, follower = followed()
     own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
-    if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.drives:
-        shape = fitted_shape(own, follower)
-        for _ in range(SHAPINGS if shape else 0):
+    if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.kind in DRIVES:
+        cosine = axial_cosine(lens.with_focal(own.focal_factor), size)
+        shape, rounds = _first_shape(own, follower, frame, cosine)
+        for _ in range(rounds):
             own, follower = followed(shape)
             own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
-            shape = fitted_shape(own, follower, shape)
+            shape = fitted_shape(own, follower, cosine, shape)
         own = replace(own, shape=shape)
     if how == "own" or not is_installed():
         return own
@@ -231,6 +236,17 @@ def find_path(
     best = other if how == "colmap" or theirs > mine else own
     note = f"camera path by {best.method}: COLMAP explains {theirs:.1%} of the held-out tracks, our own path {mine:.1%}"
     return replace(best, notes=[*own.notes, note, *other.notes] if best is own else [*best.notes, note])
+
+
+def _first_shape(
+    path: CameraPath, follower: Follower, frame: Frame, cosine: NDArray[np.float32]
+) -> tuple[DepthShape | None, int]:
+    """The shape of relative depth by triangulated points, else by the light of a tube; how often to follow again."""
+    if path.motion and path.motion.drives and (shape := fitted_shape(path, follower, cosine)):
+        return shape, SHAPINGS
+    posed = np.flatnonzero(path.explained)
+    shape = shape_by_light((frame(int(posed[i])) for i in spread(len(posed), LIT_FRAMES)), cosine)
+    return shape, 1 if shape else 0
 
 
 def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
@@ -313,9 +329,8 @@ def _estimate_notes(reason: str, path: CameraPath, lens: Lens) -> list[str]:
     how = f"; by the path, its shift is {path.motion.reason}" if path.motion and len(path.motion.parts_px) else ""
     notes = [f"{moves}: {reason}{how}; the estimated path reaches {reach:.0f} {unit} from its start"]
     if path.shape is not None:
-        notes.append(
-            f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, and triangulated points"
-        )
+        by = "and triangulated points" if path.shape.pixels else "by the light of a tube (too few points)"
+        notes.append(f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, {by}")
     if path.translation_std is not None and path.rotation_std is not None and np.isfinite(path.translation_std).any():
         moved, turned = np.nanmedian(path.translation_std), np.nanmedian(path.rotation_std)
         stds = f"{moved:.2f} {unit}, {turned:.3f} degrees"
