@@ -207,20 +207,15 @@ def find_path(
             seen = frame(index)
             return seen if shape is None else replace(seen, depth=shape.powered(seen.depth))
 
-        return own_path(
+        path, follower = own_path(
             shaped, count, lens, size, refine_focal=refine_focal, few_corners=few_corners, progress=progress
         )
+        motion = path_motion(path, follower.tracks, lens.with_focal(path.focal_factor), size)
+        return replace(path, motion=motion, shape=shape), follower
 
     own, follower = followed()
-    own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
     if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.kind in DRIVES:
-        cosine = axial_cosine(lens.with_focal(own.focal_factor), size)
-        shape, rounds = _first_shape(own, follower, frame, cosine)
-        for _ in range(rounds):
-            own, follower = followed(shape)
-            own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
-            shape = fitted_shape(own, follower, cosine, shape)
-        own = replace(own, shape=shape)
+        own, follower = _deeper(own, follower, followed, frame, axial_cosine(lens.with_focal(own.focal_factor), size))
     if how == "own" or not is_installed():
         return own
     if how == "best" and (own.breathes or own.shape or count > LONGEST):  # COLMAP would give breathing to the camera
@@ -238,15 +233,29 @@ def find_path(
     return replace(best, notes=[*own.notes, note, *other.notes] if best is own else [*best.notes, note])
 
 
-def _first_shape(
-    path: CameraPath, follower: Follower, frame: Frame, cosine: NDArray[np.float32]
-) -> tuple[DepthShape | None, int]:
-    """The shape of relative depth by triangulated points, else by the light of a tube; how often to follow again."""
-    if path.motion and path.motion.drives and (shape := fitted_shape(path, follower, cosine)):
-        return shape, SHAPINGS
-    posed = np.flatnonzero(path.explained)
-    shape = shape_by_light((frame(int(posed[i])) for i in spread(len(posed), LIT_FRAMES)), cosine)
-    return shape, 1 if shape else 0
+def _deeper(
+    path: CameraPath,
+    follower: Follower,
+    followed: Callable[[DepthShape | None], tuple[CameraPath, Follower]],
+    frame: Frame,
+    cosine: NDArray[np.float32],
+) -> tuple[CameraPath, Follower]:
+    """The path and its tracks with relative depth in the shape of triangulated points, else of the light in a tube; as
+    they are if neither gives one, or if fewer frames follow by light.
+    """
+    shape = fitted_shape(path, follower, cosine) if path.motion and path.motion.drives else None
+    if shape is None:
+        posed = np.flatnonzero(path.explained)
+        shape = shape_by_light((frame(int(posed[i])) for i in spread(len(posed), LIT_FRAMES)), cosine)
+    if shape is None:
+        return path, follower
+    new, tracks = path, follower
+    for _ in range(SHAPINGS):
+        new, tracks = followed(shape)
+        shape = fitted_shape(new, tracks, cosine, shape) or shape
+    if not shape.pixels and new.explained.sum() < path.explained.sum():
+        return path, follower
+    return replace(new, shape=shape), tracks
 
 
 def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
@@ -329,8 +338,8 @@ def _estimate_notes(reason: str, path: CameraPath, lens: Lens) -> list[str]:
     how = f"; by the path, its shift is {path.motion.reason}" if path.motion and len(path.motion.parts_px) else ""
     notes = [f"{moves}: {reason}{how}; the estimated path reaches {reach:.0f} {unit} from its start"]
     if path.shape is not None:
-        by = "and triangulated points" if path.shape.pixels else "by the light of a tube (too few points)"
-        notes.append(f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, {by}")
+        by = "triangulated points" if path.shape.pixels else "the light of a tube"
+        notes.append(f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, and {by}")
     if path.translation_std is not None and path.rotation_std is not None and np.isfinite(path.translation_std).any():
         moved, turned = np.nanmedian(path.translation_std), np.nanmedian(path.rotation_std)
         stds = f"{moved:.2f} {unit}, {turned:.3f} degrees"

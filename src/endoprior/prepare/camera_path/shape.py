@@ -9,7 +9,7 @@ camera: r is the length of the ray, and z its part along the axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -86,11 +86,9 @@ def fitted_shape(
 
     Args:
         cosine: (H, W) of `axial_cosine`.
-        before: what the depth that was followed has had applied already; None for nothing. One without points, by the
-            light, stays: points that spoke too little before rest on it now.
+        before: what the depth that was followed has had applied already; None for nothing. One by light, without
+            points, only gets another power: points that spoke too little at first rest on it now.
     """
-    if before is not None and not before.pixels:
-        return before
     tracks, count = follower.tracks, len(path.explained)
     frame = np.repeat(np.arange(count), [len(ids) for ids in tracks.ids])
     ids, pixels = np.concatenate(tracks.ids), np.concatenate(tracks.pixels).astype(np.float64)
@@ -118,6 +116,8 @@ def fitted_shape(
     power = slope * (before.power if before else 1.0)
     if not LEAST_POWER < power < MOST_POWER or clear < CLEAR:
         return before
+    if before is not None and not before.pixels:
+        return replace(before, power=power)
     left = y - slope * x
     at = [np.flatnonzero(frame == f) for f in range(count)]
     middle = before.middle if before else float(np.exp(np.median(np.log(depths))))
