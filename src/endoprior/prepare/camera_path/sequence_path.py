@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error, number_ranges
 from ...core.geometry import Convention, length_unit, to_ours
+from ...core.ranges import spread
 from ...core.shell import install_command
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import SHOWN, CameraMotion, camera_motion
@@ -26,8 +27,9 @@ from .follow import Follower, follow_camera
 from .kind import path_motion
 from .own import own_path
 from .pose_file import is_model, read_model_poses, read_poses
-from .shape import DepthShape, fitted_shape
+from .shape import DepthShape, axial_cosine, fitted_shape
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
+from .tube import shape_by_light
 
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
 NEGLIGIBLE_DEGREES = 1e-3
@@ -40,8 +42,10 @@ ONLY_IF_MOVING = ("auto", "auto-own")  # those that do so only where the camera 
 WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}  # the same, ten times faster
 FEWEST_POSED = 8  # frames; a shorter path is none
 SHAPINGS = 2
-"""Where the camera drives ahead, triangulated points fix the shape of relative depth, and the camera is followed again
-so often with the better depth."""
+"""Where the camera drives ahead, triangulated points or the light of a tube fix the shape of relative depth, and the
+camera is followed again so often with the better depth."""
+DRIVES = "forward", "backward", "translating"  # kinds of motion in which a tube is looked for
+LIT_FRAMES = 16  # number of frames that are asked for a tube
 UNKNOWN_POSES = "none: the motion of the camera is unknown"  # `sources.poses`
 Frame = Callable[[int], PoseInput]
 
@@ -203,19 +207,15 @@ def find_path(
             seen = frame(index)
             return seen if shape is None else replace(seen, depth=shape.powered(seen.depth))
 
-        return own_path(
+        path, follower = own_path(
             shaped, count, lens, size, refine_focal=refine_focal, few_corners=few_corners, progress=progress
         )
+        motion = path_motion(path, follower.tracks, lens.with_focal(path.focal_factor), size)
+        return replace(path, motion=motion, shape=shape), follower
 
     own, follower = followed()
-    own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
-    if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.drives:
-        shape = fitted_shape(own, follower)
-        for _ in range(SHAPINGS if shape else 0):
-            own, follower = followed(shape)
-            own = replace(own, motion=path_motion(own, follower.tracks, lens.with_focal(own.focal_factor), size))
-            shape = fitted_shape(own, follower, shape)
-        own = replace(own, shape=shape)
+    if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.kind in DRIVES:
+        own, follower = _deeper(own, follower, followed, frame, axial_cosine(lens.with_focal(own.focal_factor), size))
     if how == "own" or not is_installed():
         return own
     if how == "best" and (own.breathes or own.shape or count > LONGEST):  # COLMAP would give breathing to the camera
@@ -231,6 +231,31 @@ def find_path(
     best = other if how == "colmap" or theirs > mine else own
     note = f"camera path by {best.method}: COLMAP explains {theirs:.1%} of the held-out tracks, our own path {mine:.1%}"
     return replace(best, notes=[*own.notes, note, *other.notes] if best is own else [*best.notes, note])
+
+
+def _deeper(
+    path: CameraPath,
+    follower: Follower,
+    followed: Callable[[DepthShape | None], tuple[CameraPath, Follower]],
+    frame: Frame,
+    cosine: NDArray[np.float32],
+) -> tuple[CameraPath, Follower]:
+    """The path and its tracks with relative depth in the shape of triangulated points, else of the light in a tube; as
+    they are if neither gives one, or if fewer frames follow by light.
+    """
+    shape = fitted_shape(path, follower, cosine) if path.motion and path.motion.drives else None
+    if shape is None:
+        posed = np.flatnonzero(path.explained)
+        shape = shape_by_light((frame(int(posed[i])) for i in spread(len(posed), LIT_FRAMES)), cosine)
+    if shape is None:
+        return path, follower
+    new, tracks = path, follower
+    for _ in range(SHAPINGS):
+        new, tracks = followed(shape)
+        shape = fitted_shape(new, tracks, cosine, shape) or shape
+    if not shape.pixels and new.explained.sum() < path.explained.sum():
+        return path, follower
+    return replace(new, shape=shape), tracks
 
 
 def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
@@ -313,9 +338,8 @@ def _estimate_notes(reason: str, path: CameraPath, lens: Lens) -> list[str]:
     how = f"; by the path, its shift is {path.motion.reason}" if path.motion and len(path.motion.parts_px) else ""
     notes = [f"{moves}: {reason}{how}; the estimated path reaches {reach:.0f} {unit} from its start"]
     if path.shape is not None:
-        notes.append(
-            f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, and triangulated points"
-        )
+        by = "triangulated points" if path.shape.pixels else "the light of a tube"
+        notes.append(f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, and {by}")
     if path.translation_std is not None and path.rotation_std is not None and np.isfinite(path.translation_std).any():
         moved, turned = np.nanmedian(path.translation_std), np.nanmedian(path.rotation_std)
         stds = f"{moved:.2f} {unit}, {turned:.3f} degrees"

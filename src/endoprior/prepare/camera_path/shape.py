@@ -1,21 +1,22 @@
-"""The shape of relative depth, fixed by points that the camera's way triangulates.
+"""The shape of relative depth, fixed by points that the camera's way triangulates, or by the light in a tube.
 
-Depth from shading knows which tissue is far, not how far: brightness falls with the square of the distance to the lamp
-and with the cosine of the slope, and how much of either counts differs between a wall ahead and a tube. Where the
-camera drives ahead, triangulated points say it: a power of the depth for the whole clip, log z = power * log d +
-constant, and what is left at the points of each frame, spread over pixels of like depth around them.
+Depth from shading knows which tissue is far, not how far: brightness falls with the square of the distance r to the
+lamp and with the cosine of the slope, and how much of either counts differs between a wall ahead and a tube. Where the
+camera drives ahead, triangulated points say it: a power of the depth for the whole clip, log r = power * log d +
+constant, and what is left at the points of each frame, spread over pixels of like depth around them. The lamp is at the
+camera: r is the length of the ray, and z its part along the axis.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .follow import Follower
-from .tracks import CameraPath
+from .tracks import CameraPath, Lens
 
 PARALLAX_DEGREES = 2.0  # rays to a point differ by this, or its depth is that of the shading
 FEWEST = 200  # observations of such points
@@ -26,27 +27,31 @@ REACHES, LIKE = (1 / 8, 1 / 18, 1 / 36), 0.1
 left at the points after one reach is spread over the next (successive corrections)."""
 DOUBT = 0.05  # weight of no change beside that of one point at its place
 SMALL_WIDTH = 160  # the change is computed at this width, px
+MOST_RATIO = 6.0  # a distance is clipped to this ratio of the middle: the dark end of a tube has no measured one
 
 
 @dataclass(frozen=True)
 class DepthShape:
-    """How relative depth d becomes z: `middle` (d / middle)^power, and a change for each frame."""
+    """How relative depth d becomes z: `middle` (d / middle)^power `cosine`, and a change for each frame."""
 
     power: float
     middle: float
-    pixels: list[NDArray]  # (N, 2) px of the points of each frame ...
+    cosine: NDArray[np.float32]  # (H, W) of the angle between the ray of a pixel and the axis
+    pixels: list[NDArray]  # (N, 2) px of the points of each frame; an empty list without points ...
     change: list[NDArray]  # ... and (N,) the logarithm of their z as a multiple of that of the power and the scale
 
     def powered(self, depth: NDArray) -> NDArray[np.float32]:
-        """Depth with the power alone; 0 stays."""
-        return np.asarray(self.middle * (np.maximum(depth, 0) / self.middle) ** self.power, np.float32)
+        """Depth (H, W) with the power alone; 0 stays."""
+        ratio = np.maximum(depth, 0) / self.middle
+        clipped = np.clip(ratio**self.power, 1 / MOST_RATIO, MOST_RATIO)
+        return np.asarray(np.where(ratio > 0, self.middle * clipped, 0) * self.cosine, np.float32)
 
     def shaped(self, index: int, depth: NDArray) -> NDArray[np.float32]:
         """(H, W) depth of a frame with the power and its change; 0 stays."""
         powered = self.powered(depth)
-        at, change = self.pixels[index], self.change[index]
-        if not len(at):
+        if not self.pixels or not len(self.pixels[index]):
             return powered
+        at, change = self.pixels[index], self.change[index]
         height, width = depth.shape
         size = SMALL_WIDTH, max(round(height * SMALL_WIDTH / width), 1)
         small = cv2.resize(powered, size, interpolation=cv2.INTER_NEAREST)
@@ -67,11 +72,22 @@ class DepthShape:
         return np.asarray(powered * factor, np.float32)
 
 
-def fitted_shape(path: CameraPath, follower: Follower, before: DepthShape | None = None) -> DepthShape | None:
+def axial_cosine(lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
+    """(H, W) cosine of the angle between the rays of the pixels and the axis. Args: size: (W, H), px."""
+    x, y = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in size))
+    k = lens.matrix
+    return np.asarray(1 / np.sqrt(1 + ((x - k[0, 2]) / k[0, 0]) ** 2 + ((y - k[1, 2]) / k[1, 1]) ** 2), np.float32)
+
+
+def fitted_shape(
+    path: CameraPath, follower: Follower, cosine: NDArray[np.float32], before: DepthShape | None = None
+) -> DepthShape | None:
     """The shape that the path's triangulated points give the depth; `before` if there are too few, or they say little.
 
     Args:
-        before: what the depth that was followed has had applied already; None for nothing.
+        cosine: (H, W) of `axial_cosine`.
+        before: what the depth that was followed has had applied already; None for nothing. One by light, without
+            points, only gets another power: points that spoke too little at first rest on it now.
     """
     tracks, count = follower.tracks, len(path.explained)
     frame = np.repeat(np.arange(count), [len(ids) for ids in tracks.ids])
@@ -82,33 +98,39 @@ def fitted_shape(path: CameraPath, follower: Follower, before: DepthShape | None
     if len(ids) < FEWEST:
         return before
     rays = tracks.points[ids] + np.einsum("nji,nj->ni", follower.poses[frame, :3, :3], follower.poses[frame, :3, 3])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    distance = np.linalg.norm(rays, axis=1)
+    rays /= distance[:, None]
     order = np.lexsort((frame, ids))
     first = order[np.searchsorted(ids[order], ids, "left")]
     last = order[np.searchsorted(ids[order], ids, "right") - 1]
     z = np.einsum("nj,nj->n", follower.poses[frame, 2, :3], tracks.points[ids]) + follower.poses[frame, 2, 3]
     sure = (np.einsum("nj,nj->n", rays[first], rays[last]) < np.cos(np.deg2rad(PARALLAX_DEGREES))) & (z > 0)
-    frame, pixels, depths, z = frame[sure], pixels[sure], depths[sure], z[sure]
-    if len(z) < FEWEST:
+    frame, pixels, depths, distance = frame[sure], pixels[sure], depths[sure], distance[sure]
+    if len(distance) < FEWEST:
         return before
-    x, y = (_without_means(np.log(values), frame, count) for values in (depths, z))
-    slope, clear = _slope(x, y)
+    if before is not None:
+        column, row = np.clip(np.round(pixels).astype(int), 0, np.array(cosine.shape[::-1]) - 1).T
+        depths = depths / cosine[row, column]
+    x, y = (without_means(np.log(values), frame, count) for values in (depths, distance))
+    slope, clear = robust_slope(x, y)
     power = slope * (before.power if before else 1.0)
     if not LEAST_POWER < power < MOST_POWER or clear < CLEAR:
         return before
+    if before is not None and not before.pixels:
+        return replace(before, power=power)
     left = y - slope * x
     at = [np.flatnonzero(frame == f) for f in range(count)]
     middle = before.middle if before else float(np.exp(np.median(np.log(depths))))
-    return DepthShape(power, middle, [pixels[k] for k in at], [left[k] for k in at])
+    return DepthShape(power, middle, cosine, [pixels[k] for k in at], [left[k] for k in at])
 
 
-def _without_means(values: NDArray, frame: NDArray, count: int) -> NDArray:
+def without_means(values: NDArray, frame: NDArray, count: int) -> NDArray:
     """(N,) values less the mean of their frame: each frame has a scale of its own."""
     total = np.bincount(frame, weights=values, minlength=count) / np.maximum(np.bincount(frame, minlength=count), 1)
     return values - total[frame]
 
 
-def _slope(x: NDArray, y: NDArray) -> tuple[float, float]:
+def robust_slope(x: NDArray, y: NDArray) -> tuple[float, float]:
     """Slope of y by x through the origin, with robust weights, and the share of variance that it explains."""
     weight, slope = np.ones_like(x), 1.0
     for _ in range(10):
