@@ -36,7 +36,7 @@ from ..system.memory import workers
 from .neighbor_motion import fill_gaps, smooth_motion
 from .sampling import PointCloud, has_surface
 
-SPACING = 12  # largest number of frames between two anchors. With 6 the tracks of the phantoms are no better.
+SPACING = 14  # largest number of frames between two anchors. With 6 the tracks of the phantoms are no better.
 LEAST_ANCHORS = 4  # also of a short sequence: a point that is hidden in one anchor is followed by way of another
 REACH = 48  # frames to both sides of an anchor to which flow is computed
 CYCLE_PX = 0.25

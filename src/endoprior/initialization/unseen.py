@@ -101,7 +101,7 @@ def _fill(frame: Frame, points: NDArray, within: NDArray[np.bool_]) -> tuple[NDA
     inverse = np.divide(1.0, frame.depth, out=np.zeros(frame.depth.shape), where=trusted)
     count = _cell_sums(trusted, size)
     known = count > 0
-    values = np.concatenate([frame.rgb * trusted[..., None], inverse[..., None]], -1)
+    values = np.concatenate([frame.rgb * trusted[..., None], inverse[..., None]], -1, dtype=np.float32)
     means = _cell_sums(values, size) / np.maximum(count, 1)[..., None]
     filled = laplace_fill(means, known)
     row, column = np.nonzero(~covered)
@@ -110,13 +110,13 @@ def _fill(frame: Frame, points: NDArray, within: NDArray[np.bool_]) -> tuple[NDA
     return back_project(center, 1 / filled[row, column, 3], camera), filled[row, column, :3]
 
 
-def _cell_sums(image: NDArray, size: int) -> NDArray[np.float64]:
+def _cell_sums(image: NDArray, size: int) -> NDArray[np.float32]:
     """(R, C) or (R, C, K): sums over cells of `size` x `size` pixels of (H, W) or (H, W, K); the last ones are cut."""
     height, width = image.shape[:2]
     pad = [(0, -height % size), (0, -width % size), *[(0, 0)] * (image.ndim - 2)]
-    padded = np.pad(image.astype(np.float64), pad)
-    blocks = padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size, *image.shape[2:])
-    return blocks.sum((1, 3))
+    padded = np.pad(image.astype(np.float32), pad)
+    cells = padded.shape[1] // size, padded.shape[0] // size
+    return np.asarray(cv2.resize(padded, cells, interpolation=cv2.INTER_AREA), np.float32) * np.float32(size**2)
 
 
 def laplace_fill(values: NDArray, known: NDArray[np.bool_]) -> NDArray[np.float64]:

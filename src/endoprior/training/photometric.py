@@ -10,6 +10,7 @@ training frames alone, and stays fixed while training: fitted along with the tis
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Frame
 from ..model.photometric import GRID
+from ..system.memory import workers
 
 CELL_PX = 8  # side of a cell of the resized frames
 SQUARE = 0.05  # usual square of a color
@@ -106,7 +108,9 @@ def smoke_of(frames: Sequence[Frame], wanted: str) -> NDArray[np.float32] | None
     """
     if wanted == "none":
         return None
-    small = [resized(frame) for frame in frames]
+    bytes_each = 64 * frames[0].tissue_mask.size  # of a frame while it is decoded and resized
+    with ThreadPoolExecutor(workers(bytes_each)) as pool:
+        small = list(pool.map(lambda k: resized(frames[k]), range(len(frames))))
     looks = looks_of(small)
     return fitted_grids(small, looks) if wanted == "smoke" or smoke_needed(looks) else None
 
