@@ -112,7 +112,6 @@ def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
     assert not names & set(evaluate(train(plain, cfg), plain, networks=False).scores)
 
 
-@pytest.mark.slow
 def test_training_frames_and_depth_by_alpha_are_scored_beside(phantom):
     scene = still_scene(phantom)
     found = evaluate(scene, phantom, networks=False).scores
@@ -128,6 +127,7 @@ def test_training_frames_and_depth_by_alpha_are_scored_beside(phantom):
     assert found["depth_rmse_by_alpha_mm"] < found["depth_rmse_mm"], "first Gaussians are thin"
 
 
+@pytest.mark.slow
 def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
     """The demo's path at a small size; its full size is `make demo`."""
     from endoprior import phantom as package
