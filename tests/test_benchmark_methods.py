@@ -82,7 +82,14 @@ def test_plugins_and_images_stand_in_the_tables(tmp_path):
     write_report(run_matrix(spec, out, in_this_process), out)
     text = (out / "results.md").read_text()
     heads, _, *rows = [line for line in text.split("## ph\n")[1].splitlines() if line.startswith("|")][:6]
-    assert heads.startswith("| method | tissue PSNR, dB | depth RMSE, mm | flow error (DIS), px | mean absolute error")
+    wanted = [
+        "tissue PSNR, dB",
+        "training PSNR, dB",
+        "depth RMSE, mm",
+        "flow error (DIS), px",
+        "mean absolute error, %",
+    ]
+    assert heads.startswith(" | ".join(["| method", *wanted]))
     assert [row.split(" | ")[0] for row in rows] == ["| nearest", "| Mean image", "| Theirs", "| seeded"]
     facts = json.loads((out / "results.json").read_text())
     found = {(c["sequence"], c["method"], c["seed"]): c for c in facts["cells"]}

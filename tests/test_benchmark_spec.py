@@ -216,6 +216,29 @@ def test_the_ladder_leads_from_endogaussian_to_released(size):
             assert spec.config(step, sequence, None, 0) == want
 
 
+FULL = ("full/compared", "whole/clip", "whole/phantom")
+
+
+@pytest.mark.parametrize("name", ["full/compared", "sized/compared", "whole/clip", "whole/phantom", "whole/small"])
+def test_each_compared_method_is_there_as_released_and_fitted_to_the_clip(name):
+    spec = load_spec(find_spec(name))
+    fitted = [method for method in spec.methods if method.endswith("_fitted")]
+    assert {*spec.methods} == {*fitted, *(one.removesuffix("_fitted") for one in fitted)} | {"default"} | (
+        {"best"} & {*spec.methods}
+    )
+    (sequence,) = [*spec.sequences][:1]
+    for method in fitted:
+        found = spec.config(method, sequence, None, 0)
+        assert found.fit_to_clip
+        assert found.replace({"fit_to_clip": False}) == spec.config(method.removesuffix("_fitted"), sequence, None, 0)
+    start = {method: spec.config(method, sequence, None, 0).init.budget for method in ("endogaussian", "default")}
+    assert start["endogaussian"] == start["default"] == (30_000 if name in FULL else 7500)
+    equal = load_spec(find_spec(name.split("/")[0].replace("whole", "full") + "/matched"))
+    on = next(iter(equal.sequences))
+    starts = [equal.config(method, on, None, 0).init.budget for method in ("endogaussian", "paper")]
+    assert starts[0] == starts[1], "claims of the paper are judged at an equal start"
+
+
 def test_scared_has_the_settings_published_for_it():
     """EndoGaussian's and the released code's; the paper says nothing but EndoGaussian's schedule."""
     spec, methods = load_spec(find_spec("reproduce/table1_scared")), load_spec(find_spec("reproduce/table1"))
@@ -253,9 +276,7 @@ def test_depth_flags_change_the_flags_and_nothing_else(size):
 
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
     names = spec_names()
-    assert {"quick", "found_masks", "poses", "sized", "sized/whole_clip", "full", "reproduce", "reproduce/table1"} <= {
-        *names
-    }
+    assert {"quick", "found_masks", "poses", "sized", "whole/clip", "full", "reproduce", "reproduce/table1"} <= {*names}
     assert not [name for name in names if "_small" in name], "it is only there to be extended"
     monkeypatch.chdir(tmp_path)
     written(tmp_path).rename("quick")

@@ -14,7 +14,7 @@ from endoprior_studies.report import change, claims_section
 from endoprior_studies.results import Results
 from endoprior_studies.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
 from endoprior_studies.statistics import Difference, Pair, difference, gains, summary, verdict
-from endoprior_studies.tables import csv_lines, latex, markdown, number, score_table
+from endoprior_studies.tables import csv_lines, latex, markdown, number, score_table, with_training
 
 
 def test_summary_by_hand():
@@ -102,6 +102,14 @@ def test_table_ranks_rounds_and_leaves_out_what_nobody_has():
     assert [e.text for e in a] == ["31.0 ± 1.0", "0.5000 ± 0.0000", "12,345 ± 0", "-"]
     assert [e.rank for e in a] == [2, 2, 0, 0] and [e.rank for e in b] == [1, 1, 0, 0]
     assert b[3].text == "0.0414"
+
+
+def test_training_psnr_stands_beside_that_of_held_out_frames():
+    measured = results()
+    scores = {cell: {**values, "psnr_train": 40.0} for cell, values in measured.scores.items()}
+    assert score_table(replace(measured, scores=scores), "s").columns[:2] == ["PSNR, dB", "training PSNR, dB"]
+    assert with_training(["ssim", "psnr_tissue", "fps"]) == ["ssim", "psnr_tissue", "psnr_train", "fps"]
+    assert with_training(["ssim"]) == ["ssim"] and with_training(["psnr", "psnr_train"]) == ["psnr", "psnr_train"]
 
 
 def test_lengths_on_a_sequence_of_relative_depth_are_not_called_mm():

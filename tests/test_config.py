@@ -15,7 +15,7 @@ from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.model.gaussians import motion_shape
-from endoprior.model.method import config_from
+from endoprior.model.method import config_from, method_of
 from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.folder import reject_other_run
@@ -77,9 +77,10 @@ def test_the_preset_default_is_that_of_the_class():
     assert preset("default") == Config()
 
 
-def test_there_are_at_most_72_fields():
-    # The last two: publications take all frames; whether a clip shows smoke is measured, and that can be wrong.
-    assert len(dict(leaves(to_dict(Config())))) <= 72
+def test_there_are_at_most_73_fields():
+    # The last three: publications take all frames; whether a clip shows smoke is measured, and that can be wrong;
+    # each compared method is shown as released and fitted to the clip.
+    assert len(dict(leaves(to_dict(Config())))) <= 73
 
 
 def test_baseline_knows_no_prior():
@@ -100,6 +101,22 @@ def test_basis_functions_follow_the_length_of_the_sequence():
     assert fitted.deformation.basis.num_bases == 27 and fitted.fitted(99) == fitted
     with pytest.raises(ValueError, match="num_bases: expected at least 2"):
         motion_shape(preset("default").deformation)
+
+
+@pytest.mark.parametrize("name", ["endogaussian", "paper", "released", "endogs", "endo4dgs"])
+def test_planes_fitted_to_the_clip_have_half_a_cell_a_frame_in_the_half_that_times_use(name):
+    cfg = preset(name, fit_to_clip=True)
+    for frames in (24, 48, 156):
+        fitted = method_of(cfg).fitted(cfg, frames)
+        assert (fitted.deformation.hexplane.time_resolution - 1) / 2 / frames == 0.5
+        assert method_of(cfg).fitted(fitted, frames) == fitted, "so that a run resumes"
+    as_released = preset(name)
+    assert method_of(cfg).fitted(as_released, 24).deformation.hexplane == as_released.deformation.hexplane
+
+
+def test_a_run_fitted_to_the_clip_cannot_be_extended():
+    with pytest.raises(InputError, match="--fit-to-clip takes shares"):
+        preset("endogs", fit_to_clip=True).extended(9000)
 
 
 def test_replaced_fields_are_set_and_the_others_stay():
@@ -210,7 +227,9 @@ def told(capsys):
 def test_what_the_version_before_stored_is_the_preset_of_today(name, told):
     stored = former(name)
     assert len(dict(leaves(stored))) == 141
-    assert config_from(stored) == config_from(stored) == preset(name, **{"render.photometric": "none"})
+    since = {"endogaussian": {"init.budget": 20_000}, "endo4dgs": {"render.depth_grad_to_means": False}}
+    former_values = {"render.photometric": "none"} | since.get(name, {})
+    assert config_from(stored) == config_from(stored) == preset(name, **former_values)
     assert told() == (
         "endoprior: stored config: 80 of its fields are constants of this version, with the same values\n"
     )

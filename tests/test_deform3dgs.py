@@ -51,6 +51,22 @@ def test_a_gaussian_has_510_coefficients_that_start_at_rest():
     assert offsets.opacity_logits is None and offsets.sh_dc is None
 
 
+def test_fitted_to_the_clip_a_held_out_frame_shares_basis_functions_with_its_neighbors(tiny_sequence, tmp_path):
+    cfg = preset("deform3dgs", fit_to_clip=True)
+    for frames, width in ((12, 1 / 12), (24, 1 / 24), (48, 0.035), (156, 0.035)):
+        fitted = METHOD.fitted(cfg, frames)
+        assert fitted.first_width == width and METHOD.fitted(fitted, frames) == fitted
+        gaussians = create_gaussians(np.zeros((1, 3)), np.full((1, 3), 0.5), np.zeros(1), fitted)
+        centers, widths = (gaussians[name][0, :, 0].detach().double() for name in COEFFICIENTS[1:])
+        times = torch.arange(frames)[:, None] / frames
+        seen = torch.exp(-(((times - centers) ** 2 / (widths**2 + 1e-4)) ** 2))  # (T, B)
+        shared = torch.minimum(seen[1:-1], torch.maximum(seen[:-2], seen[2:])).amax(1)
+        assert float(shared.min()) > 0.1, "of each frame, with one of its neighbors"
+    short = tiny().replace({"fit_to_clip": True})
+    scene = trained_and_resumed(load_sequence(tiny_sequence), short, tmp_path, stop_at=4)
+    assert scene.config.first_width == 1 / len(scene.cameras)
+
+
 def test_channels_are_centers_then_rotation_then_scales():
     cfg = preset("deform3dgs")
     gaussians = create_gaussians(np.zeros((1, 3)), np.full((1, 3), 0.5), np.zeros(1), cfg)

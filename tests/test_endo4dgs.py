@@ -134,6 +134,19 @@ def test_the_loss_by_hand(tiny_sequence):
     assert set(terms) == {"color", "depth", "gradient", "normal", "confidence"}
 
 
+def test_depth_is_divided_by_alpha_and_confidence_trains_nothing(tiny_sequence):
+    frame = TrainingFrames(load_sequence(tiny_sequence)).frame(0)
+    alpha = torch.linspace(0.2, 0.9, frame.depth.numel()).reshape(frame.depth.shape).requires_grad_()
+    out = RenderOutput(frame.rgb + 0.1, alpha, alpha.detach() * frame.depth, torch.zeros(1, 2), torch.zeros(1))
+    gray = create_gaussians(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), CFG).splats(None, 0)
+    drawn = Drawn(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
+    terms = METHOD.terms(drawn, CFG, NUMBA)
+    assert float(terms["depth"].detach()) == pytest.approx(0, abs=1e-6)
+    (1e6 * terms["confidence"]).backward()
+    assert float(alpha.grad.abs().max()) < 0.1, "only by the depth, which fits: not by the confidence"
+    assert CFG.render.depth_grad_to_means
+
+
 def test_a_frame_without_tissue_has_finite_terms_and_gradients(tiny_sequence):
     frame = TrainingFrames(load_sequence(tiny_sequence)).frame(0)
     none = torch.zeros_like(frame.tissue_mask)

@@ -195,6 +195,10 @@ def test_it_grows_often_prunes_seldom_and_resets():
     assert pruned.remove.tolist() == [False, False, True, True, False]
     due = [i for i in (400, 500, 600, 3000, 6000, 12_000, 48_000) if METHOD.reset_due(Stage.FINE, i, CFG)]
     assert due == [500, 6000, 12_000]
+    fitted = METHOD.fitted(CFG.replace({"fit_to_clip": True, "schedule.fine_iterations": 1200}), 24)
+    assert fitted.density.stop_iteration == 900 and METHOD.fitted(fitted, 24) == fitted
+    assert [i for i in range(1, 1201) if METHOD.reset_due(Stage.FINE, i, fitted)] == [840]
+    assert not METHOD.reset_due(Stage.COARSE, 840, fitted)
     assert not METHOD.density_due(Stage.FINE, 45_000, False, CFG) and METHOD.density_due(Stage.COARSE, 600, False, CFG)
 
 

@@ -112,6 +112,21 @@ def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
     assert not names & set(evaluate(train(plain, cfg), plain, networks=False).scores)
 
 
+def test_training_frames_and_depth_by_alpha_are_scored_beside(phantom):
+    scene = still_scene(phantom)
+    found = evaluate(scene, phantom, networks=False).scores
+    trained = evaluate(scene, phantom, "train", networks=False)
+    assert len(phantom.indices("train")) <= 8 and found["psnr_train"] == trained.scores["psnr_tissue"]
+    assert "psnr_train" in trained.skipped
+    by_hand = []
+    for frame in phantom.frames("test"):
+        out, counted = scene.render(frame.time, frame.camera), frame.tissue_mask & frame.depth_valid
+        depth = out.depth.numpy()[counted] / np.maximum(out.alpha.numpy()[counted], 1e-6)
+        by_hand.append(np.sqrt(np.mean((depth.astype(np.float64) - frame.depth[counted]) ** 2)))
+    assert found["depth_rmse_by_alpha_mm"] == pytest.approx(np.mean(by_hand), rel=1e-6)
+    assert found["depth_rmse_by_alpha_mm"] < found["depth_rmse_mm"], "first Gaussians are thin"
+
+
 @pytest.mark.slow
 def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
     """The demo's path at a small size; its full size is `make demo`."""

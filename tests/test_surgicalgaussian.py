@@ -204,6 +204,9 @@ def test_growth_removal_and_resets():
     for cfg, wanted in ((published, [500, 3000]), (CFG, [500])):
         assert [i for i in (400, 500, 3000, 3100, 15_000) if METHOD.reset_due(Stage.FINE, i, cfg)] == wanted
     assert CFG.density.stop_iteration / CFG.schedule.fine_iterations == 15_000 / 40_000
+    fitted = METHOD.fitted(CFG.replace({"fit_to_clip": True, "schedule.fine_iterations": 930}), 24)
+    assert fitted.density.stop_iteration == 349
+    assert [i for i in range(1, 931) if METHOD.reset_due(Stage.FINE, i, fitted)] == [279]
 
 
 # All together.

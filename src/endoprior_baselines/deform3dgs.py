@@ -8,7 +8,8 @@ differs from the release, and why, is in docs/methods.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from typing_extensions import override
 
 from endoprior.core.config import Config
 from endoprior.core.geometry import project
+from endoprior.core.ranges import Range
 from endoprior.core.types import Frame
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.initialization.sampling import PointCloud, concatenated, has_surface
@@ -34,6 +36,8 @@ NUM_BASES = 17
 CHANNELS = {"means": 3, "quats": 4, "log_scales": 3}
 """What moves, in the order of the channels."""
 FIRST_WIDTH = 0.01
+OVERLAPPING_WIDTH = 0.035
+"""With this first width, 0.56 of the distance of their centers, neighboring basis functions overlap."""
 SPATIAL_SCALE = 10.0
 """Factor of the rates of centers and coefficients, whatever the camera does."""
 MOVING_PERCENTILE = 95.0
@@ -48,6 +52,20 @@ MOST, DRAWN = 600_000, 500_000
 """Of more points than the first number, so many are drawn."""
 
 
+@dataclass(frozen=True)
+class Deform3DGSConfig(Config):
+    """See `Config`."""
+
+    first_width: Annotated[float, Range(1e-4, 1)] = FIRST_WIDTH
+    """Width of the basis functions at the start, as a share of the clip."""
+
+
+def first_width_of(cfg: Config) -> float:
+    """`Deform3DGSConfig.first_width`."""
+    assert isinstance(cfg, Deform3DGSConfig)
+    return cfg.first_width
+
+
 class LearnedBasisMotion(Motion):
     """Coefficients of each Gaussian: weight, center and width of 17 basis functions in each of 10 channels."""
 
@@ -59,7 +77,7 @@ class LearnedBasisMotion(Motion):
     def first_tensors(self, num: int, cfg: Config) -> dict[str, Tensor]:
         size = (num, NUM_BASES, sum(CHANNELS.values()))
         centers = torch.linspace(0, 1, NUM_BASES)[None, :, None].expand(size)
-        return dict(zip(COEFFICIENTS, (torch.zeros(size), centers, torch.full(size, FIRST_WIDTH)), strict=True))
+        return dict(zip(COEFFICIENTS, (torch.zeros(size), centers, torch.full(size, first_width_of(cfg))), strict=True))
 
     @override
     def offsets(
@@ -86,12 +104,24 @@ class Deform3DGS(Released):
     color_is_error = True
     first_share = SHARE
     clone_extent = 0.0  # what grows is split
+    config_type = Deform3DGSConfig
     name = "deform3dgs"
     way = LearnedBasisMotion()
     changes: ClassVar[Mapping[str, Any]] = {  # the rates are those of 3DGS: the defaults
         "loss.tv_weight": 0.0,
         "schedule.coarse_iterations": 0,
     }
+
+    @override
+    def config(self) -> Config:
+        return Deform3DGSConfig(**vars(super().config()))
+
+    @override
+    def fitted(self, cfg: Config, num_frames: int) -> Config:
+        """A basis function reaches into its neighbors, and at least one frame far."""
+        cfg = super().fitted(cfg, num_frames)
+        assert isinstance(cfg, Deform3DGSConfig)
+        return replace(cfg, first_width=max(OVERLAPPING_WIDTH, 1 / num_frames)) if cfg.fit_to_clip else cfg
 
     @override
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:

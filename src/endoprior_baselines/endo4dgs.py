@@ -69,6 +69,7 @@ class Endo4DGS(Released):
         "deformation.hexplane.time_resolution": 75,
         "deformation.hexplane.channels": 32,
         "deformation.hexplane.multires": (1, 2),
+        "render.depth_grad_to_means": True,
         "density.stop_iteration": 1500,
         "optim.decay_iterations": 20_000,
         "schedule.sh_every": 1000,
@@ -91,21 +92,22 @@ class Endo4DGS(Released):
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         frame, out = drawn.frame, drawn.out
         mask, color = frame.tissue_mask[..., None], out.color * frame.tissue_mask[..., None]
-        known, valid = frame.depth, frame.measured & (out.depth > 0)
-        depth, target = without_scale(out.depth, valid), without_scale(known, valid)
+        z = out.depth / out.alpha.clamp(min=LEAST_CONFIDENCE)
+        known, valid = frame.depth, frame.measured & (z > 0)
+        depth, target = without_scale(z, valid), without_scale(known, valid)
         facing = (normal_picture(drawn.splats, drawn.render) * normals_of_depth(known)).sum(-1)
-        trust = out.alpha[frame.tissue_mask]
-        picture = confident_error(out.color[frame.tissue_mask], frame.rgb[frame.tissue_mask], trust)
-        surface = confident_error(depth[valid][:, None], target[valid][:, None], out.alpha[valid])
+        trust = out.alpha.detach()
+        picture = confident_error(out.color[frame.tissue_mask], frame.rgb[frame.tissue_mask], trust[frame.tissue_mask])
+        surface = confident_error(depth[valid][:, None], target[valid][:, None], trust[valid])
         terms = {
             "color": ((color - frame.rgb) * mask).abs().mean(),
             "depth": DEPTH_WEIGHT * (depth - target).abs().mean(),
-            "gradient": GRADIENT_WEIGHT * gradient_correlation(out.depth, known, valid),
+            "gradient": GRADIENT_WEIGHT * gradient_correlation(z, known, valid),
             "normal": NORMAL_WEIGHT * ((1 - facing) * frame.measured).abs().mean(),
             "confidence": CONFIDENCE_WEIGHT * picture + CONFIDENCE_WEIGHT * surface,
         }
         if drawn.stage is Stage.FINE:
-            terms["tv"] = TV_WEIGHT * (total_variation(color) + total_variation(out.depth * frame.tissue_mask))
+            terms["tv"] = TV_WEIGHT * (total_variation(color) + total_variation(z * frame.tissue_mask))
         return terms | planes_of(drawn, PLANES)
 
     @override

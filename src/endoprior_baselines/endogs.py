@@ -116,6 +116,7 @@ class EndoGS(Released):
 
     background = (1.0, 1.0, 1.0)
     keeps_optimizer = True
+    growth_ends, last_reset = 0.75, 0.7
     name = "endogs"
     way = JointMotion()
     changes: ClassVar[Mapping[str, Any]] = {  # published: 3,000 and 60,000 iterations
@@ -182,7 +183,7 @@ class EndoGS(Released):
         return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split, removed_by=rules)
 
     @override
-    def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
+    def released_reset_due(self, iteration: int, cfg: Config) -> bool:
         """The first one belongs to the white background."""
         inside = iteration < cfg.density.stop_iteration
         return inside and (iteration == FIRST_RESET or iteration % RESET_EVERY == 0)

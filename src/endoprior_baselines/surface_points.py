@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from endoprior.initialization.sampling import MIN_POINTS, PointCloud, concatenat
 from endoprior.model.motion import Motion
 from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod
+from endoprior.training.trainer import Stage
 
 
 class Released(GaussianMethod):
@@ -28,6 +30,9 @@ class Released(GaussianMethod):
     """What its preset changes in `paper` besides."""
     way: ClassVar[Motion]
     """How its Gaussians move."""
+    growth_ends, last_reset = 0.0, 0.0
+    """Shares of the published fine stage after which growth ends and opacities are lowered last; 0: not before its end,
+    never. `fit_to_clip` takes them of the stage that is trained, and lowers opacities once."""
 
     def config(self) -> Config:
         """What its preset starts from."""
@@ -35,8 +40,26 @@ class Released(GaussianMethod):
         return paper().replace(common | dict(self.changes))
 
     @override
+    def fitted(self, cfg: Config, num_frames: int) -> Config:
+        cfg = super().fitted(cfg, num_frames)
+        if not (cfg.fit_to_clip and self.growth_ends):
+            return cfg
+        stop = round(self.growth_ends * cfg.schedule.fine_iterations)
+        return replace(cfg, density=replace(cfg.density, stop_iteration=stop))
+
+    @override
     def motion(self, cfg: Config) -> Motion:
         return self.way
+
+    @override
+    def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
+        if cfg.fit_to_clip:
+            return stage is Stage.FINE and iteration == round(self.last_reset * cfg.schedule.fine_iterations)
+        return self.released_reset_due(iteration, cfg)
+
+    def released_reset_due(self, _iteration: int, _cfg: Config) -> bool:
+        """See `reset_due`, with the numbers of the release."""
+        return False
 
 
 def grid_points(frames: Sequence[Frame], every_px: int, first_px: int) -> PointCloud:

@@ -192,6 +192,7 @@ class SurgicalGaussian(Released):
 
     background = (1.0, 1.0, 1.0)
     first_share = 1 / EVERY_PX**2
+    growth_ends, last_reset = 0.375, 0.3
     name = "surgicalgaussian"
     way = NetworkMotion()
     changes: ClassVar[Mapping[str, Any]] = {  # published: 40,000 iterations, growth before 15,000, decay over 30,000
@@ -247,7 +248,7 @@ class SurgicalGaussian(Released):
         return Plan(clone=planned.clone & ~large, split=planned.split, remove=planned.remove | large, removed_by=rules)
 
     @override
-    def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
+    def released_reset_due(self, iteration: int, cfg: Config) -> bool:
         """The first one belongs to the white background."""
         inside = iteration < cfg.density.stop_iteration
         return inside and (iteration == FIRST_RESET or iteration % RESET_EVERY == 0)

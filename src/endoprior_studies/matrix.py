@@ -227,7 +227,11 @@ class _Runner:
 
 
 def _identity(options: dict[str, Any], fold: int) -> dict[str, Any]:
-    """The options that name a cell's folder: without the phase of the published split, which earlier cells lack."""
+    """The options that name a cell's folder: without the phase of the published split, and what is not fitted to the
+    clip, which earlier cells lack.
+    """
+    if options.get("fit_to_clip") is False:
+        options = {name: value for name, value in options.items() if name != "fit_to_clip"}
     data = options.get("data")
     if fold or not isinstance(data, dict):
         return options

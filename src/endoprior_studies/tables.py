@@ -26,6 +26,8 @@ from .results import Results
 from .spec import Cell, MatchSpec, PublishedSpec, Spec
 from .statistics import Summary, summary
 
+TRAINING = "psnr_train"
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -51,7 +53,7 @@ def score_table(results: Results, sequence: str, scores: Mapping[str, Score] | N
     Of several folds it is their mean.
 
     Args:
-        scores: columns, if there is any value; default: those of the spec.
+        scores: columns, if there is any value; default: those of the spec, `with_training`.
         title: default: the name of the sequence.
     """
     spec = results.spec
@@ -63,7 +65,7 @@ def score_table(results: Results, sequence: str, scores: Mapping[str, Score] | N
         for method in spec.methods
         if method in sized or not spec.budgets or budget == spec.budgets[0]
     ]
-    about = {name: all_scores()[name] for name in spec.scores} if scores is None else scores
+    about = {name: all_scores()[name] for name in with_training(spec.scores)} if scores is None else scores
     columns = [score for score in about if any(results.summary(sequence, *row, score).count for row in rows)]
     by_column = []
     for score in columns:
@@ -76,6 +78,15 @@ def score_table(results: Results, sequence: str, scores: Mapping[str, Score] | N
         [about[score].heading(sequence in results.relative) for score in columns],
         [(name, [column[i] for column in by_column]) for i, name in enumerate(names)],
     )
+
+
+def with_training(scores: Sequence[str]) -> list[str]:
+    """The columns of a table: behind the PSNR of held-out frames that of training frames, which tells chance apart."""
+    of_test = [name for name in scores if name in ("psnr", "psnr_tissue")]
+    if not of_test or TRAINING in scores:
+        return [*scores]
+    place = scores.index(of_test[-1]) + 1
+    return [*scores[:place], TRAINING, *scores[place:]]
 
 
 def _ranks(score: Score, means: list[float]) -> list[int]:

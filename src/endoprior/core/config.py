@@ -251,6 +251,8 @@ class Config(Checked):
     """Whose rules start, draw, compare and grow: ours, or those of another installed method (docs/methods.md)."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random choices. Sampling, initial weights, frame order and splits."""
+    fit_to_clip: bool = False
+    """Fit a published method to the length of the clip and of the training (docs/methods.md); `default` always is."""
     data: DataConfig = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     deformation: DeformationConfig = field(default_factory=DeformationConfig)
@@ -302,9 +304,15 @@ class Config(Checked):
         if total <= coarse:
             want = f"more than the {coarse:,} of the coarse stage"
             raise input_error("--iterations", want, f"{total:,}", "choose more.")
+        if self.fit_to_clip:
+            want, fix = "the same length, of which --fit-to-clip takes shares", "Train anew with --iterations."
+            raise input_error("--iterations", want, f"{total:,}", fix)
         density = replace(self.density, stop_iteration=min(self.density.stop_iteration, fine))
         return replace(self, schedule=replace(self.schedule, fine_iterations=total - coarse), density=density)
 
     def fitted(self, num_frames: int) -> Config:
         """The config with the fields filled in that depend on the length of the sequence."""
-        return replace(self, deformation=replace(self.deformation, basis=self.deformation.basis.fitted(num_frames)))
+        deformation = self.deformation
+        if self.fit_to_clip:
+            deformation = replace(deformation, hexplane=deformation.hexplane.fitted(num_frames))
+        return replace(self, deformation=replace(deformation, basis=deformation.basis.fitted(num_frames)))

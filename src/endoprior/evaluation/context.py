@@ -26,7 +26,7 @@ EXACT = "infinite: the rendered frames equal the true ones exactly"
 """Why there is no PSNR where no frame has any error; black frames, for example."""
 NETWORKS_OFF = "network scores were not asked for"
 NO_SCENE = "needs a scene; there are rendered images only"
-TOO_SLOW = "needs every frame of the video, which a radiance field renders for hours on a CPU"
+TOO_SLOW = "needs other frames of the video, which a radiance field renders for hours on a CPU"
 NO_GAUSSIANS = "needs the Gaussians of a scene; this one has none"
 NO_DEPTH = "needs depth, which was not rendered for every frame"
 Rendering = tuple[NDArray[np.float32], NDArray[np.float32] | None]
@@ -195,10 +195,14 @@ class EvaluationContext:
     @property
     def video(self) -> FrameList:
         """All frames of the sequence, for scores that render each; ScoreUnavailable where that would take hours."""
+        self.reject_slow_frames()
+        return self.sequence.frames("video")
+
+    def reject_slow_frames(self) -> None:
+        """ScoreUnavailable where rendering frames beside those of the split would take hours."""
         scene = self.reconstruction.scene if isinstance(self.reconstruction, SceneFrames) else None
         if scene is not None and not isinstance(scene, Scene) and scene.device.type == "cpu":
             raise ScoreUnavailable(TOO_SLOW)
-        return self.sequence.frames("video")
 
     @cached_property
     def rendered(self) -> RenderedFrames:

@@ -57,6 +57,10 @@ class Method(ABC):
     def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> RenderedScene:
         """The scene whose arrays these are; they fit `schema`. InputError: a value that no scene can have."""
 
+    def fitted(self, cfg: Config, num_frames: int) -> Config:
+        """The config with what depends on the length of the sequence; fitting it again changes nothing."""
+        return cfg.fitted(num_frames)
+
     def motion(self, cfg: Config) -> Motion:
         """How its Gaussians move; TypeError if it has none."""
         raise TypeError(f"{cfg.method} has no Gaussians")

@@ -103,7 +103,7 @@ def endogaussian() -> Config:
     return replace(
         base,
         data=replace(base.data, lift_missing_depth=True),
-        init=replace(base.init, sampler="pool"),
+        init=replace(base.init, sampler="pool", budget=30_000),
         density=replace(base.density, min_densify_weight=1.0),
         temporal=replace(base.temporal, weight=0.0),
         released=ReleasedMethod(half_pixel_shift=True),

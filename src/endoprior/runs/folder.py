@@ -160,7 +160,8 @@ def reject_unextendable(run: Path, cfg: Config, num_frames: int) -> None:
     file, wanted = run / CONFIG, cfg.schedule.total
     stored = read_json(file, "pass the folder of a run.")
     former = config_of(stored.get("config"), file)
-    _reject_other_config(file, former.extended(wanted).fitted(num_frames), cfg.fitted(num_frames))
+    fitted = (method_of(cfg).fitted(some, num_frames) for some in (former.extended(wanted), cfg))
+    _reject_other_config(file, *fitted)
     windows = stored.get("windows")
     parts = [window_file(run / SCENE, k).parent for k in range(len(windows))] if isinstance(windows, list) else [run]
     done = [_iterations_done(part / CHECKPOINT, former) for part in parts]

@@ -111,8 +111,8 @@ class GaussianTrainer(Trainer):
         if cfg.data.eyes == "both" and sequence.right_eye is None:
             fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."
             raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
-        self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
         self.method = cast("GaussianMethod", method_of(cfg))
+        self.sequence, self.cfg = sequence, self.method.fitted(cfg, len(sequence))
         self.motion = self.method.motion(self.cfg)
         self.device = device_for(cfg.render.backend)
         self.ops = ops or ops_for(self.device)

@@ -76,7 +76,7 @@ def least_bytes(cfg: Config, num: int, num_train: int, width: int, height: int) 
     """Memory that training needs beyond what the process uses already, with `num` first Gaussians.
 
     Args:
-        cfg: fitted to the sequence (`Config.fitted`). width, height: of its `num_train` frames, px.
+        cfg: fitted to the sequence (`Method.fitted`). width, height: of its `num_train` frames, px.
     """
     schema = method_of(cfg).schema(cfg)
     sizes = {
@@ -96,7 +96,7 @@ def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
     """Raise InputError, with both numbers, for a training that needs more than the free memory."""
     free = available_bytes()
     camera, num_train, num = sequence.camera(0), len(sequence.indices("train")), first_count(sequence, cfg)
-    least = least_bytes(cfg.fitted(len(sequence)), num, num_train, camera.width, camera.height)
+    least = least_bytes(method_of(cfg).fitted(cfg, len(sequence)), num, num_train, camera.width, camera.height)
     if free is None or least <= free:
         return
     fewer = ", --gaussians" if num == cfg.init.budget else ""

@@ -30,7 +30,7 @@ class RadianceMethod(Method):
 
     has_gaussians = False
     config_type = RadianceFieldConfig
-    only: Mapping[str, Any] = {"data.eyes": "left", "init.motion": "rest"}
+    only: Mapping[str, Any] = {"data.eyes": "left", "init.motion": "rest", "fit_to_clip": False}
 
     def __init__(self, kind: type[RadianceField], config: Callable[[], Config]) -> None:
         self.kind, self._config = kind, config

@@ -20,9 +20,12 @@ from .image import check_finite_float, checked_mask
 if TYPE_CHECKING:
     from ..context import EvaluationContext
 
+LEAST_ALPHA = 1e-6
 SCORES = scores_from("""
     depth_rmse_mm | depth RMSE | mm | lower | 3 | relative | depth | 0 is exact; measured depth errs too
         Root mean square error of rendered depth where depth was measured on tissue.
+    depth_rmse_by_alpha_mm | depth RMSE by alpha | mm | lower | 3 | relative | depth | -
+        The same of rendered depth divided by alpha, as some methods train it: thin tissue is not too near.
     depth_rmse_endogaussian | depth RMSE (EndoGaussian's) |  | lower | 3 | relative | depth | -
         The depth figure of EndoGaussian's program, whose 8-bit depths wrap; only to compare with its tables.
     depth_instability_mm | depth instability | mm | lower | 3 | relative | depth | includes true motion
@@ -40,6 +43,13 @@ def compute(context: EvaluationContext) -> None:
             wrapped = depth_rmse_8bit(depth, frame.depth, mask, mask.size)
             rows.append({"depth_rmse_mm": rmse, "depth_rmse_endogaussian": wrapped})
         context.add_frames(rows, "no tissue with measured depth")
+    with context.skip_if_unavailable("depth_rmse_by_alpha_mm"):
+        values = []
+        for frame in context.frames:
+            out = context.scene.render(frame.time, frame.camera)
+            depth = (out.depth / out.alpha.clamp(min=LEAST_ALPHA)).cpu().numpy()
+            values.append(depth_rmse(depth, frame.depth, frame.tissue_mask & frame.depth_valid))
+        context.add_mean("depth_rmse_by_alpha_mm", values, "no tissue with measured depth")
     with context.skip_if_unavailable("depth_instability_mm"):
         values, rendered = [], context.rendered
         for a, b in pairwise(context.video):
