@@ -27,6 +27,7 @@ AGREEMENT = 0.6  # correlation of the aligned images; other scenes reach 0.45
 SURE_PX = 0.5  # standard deviation of the mean shift, px of the finest images
 RETURN_PX = 1.5  # distance between the way there and the way back, px of the finest images
 DARK = 24  # gray level below which what touches the edge of both images is a border, which does not move
+COARSEST_PX = 2  # least side of the coarsest images, px: OpenCV correlates none that are smaller
 RIM_PX = 5  # what lies nearer to it than this is not used either, px of the finest images
 
 
@@ -40,6 +41,8 @@ def align(
     """
     factor = min(1.0, FINEST_PX / before.shape[1])
     size = tuple(max(round(side * factor), 1) for side in before.shape[::-1])
+    if min(size) < COARSEST_PX << HALVINGS:
+        return None
     small = [np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8) for image in (before, now)]
     inside = ~_border(np.maximum(*small))
     pair = [_Level.of(image, mask, inside) for image, mask in zip(small, (allowed_before, allowed), strict=True)]
