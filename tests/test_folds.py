@@ -231,6 +231,7 @@ def former_name(spec: Spec, data: Path, method: str, *more) -> str:
     """Folder of a cell by a version without folds: a hash of all options of that version, and more."""
     options = to_dict(spec.config(method, "tiny", None, 0))
     options.get("data", {}).pop("test_phase", None)
+    options.pop("fit_to_clip", None)
     facts = [options, load_sequence(data).fingerprint(), False, SCORES_VERSION, *more]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
 
