@@ -109,3 +109,11 @@ def test_there_is_something_to_check():
     """The patterns above match: a page that shows every kind."""
     assert ["train", "DATA", "RUN"] in commands(ROOT / "README.md") and "your-own-video" in anchors(ROOT / "README.md")
     assert sum(len(commands(page)) for page in PAGES) > 50 and {"test", "docs"} <= TARGETS
+
+
+def test_page_of_check_names_every_problem():
+    lines = re.findall(r"^- (`.*?) \(", (ROOT / "docs" / "check.md").read_text(), re.MULTILINE)
+    source = (ROOT / "src" / "endoprior" / "check" / "findings.py").read_text()
+    codes = set(re.findall(r"`([a-z0-9-]+)`", " ".join(lines)))
+    assert codes and all(f'"{code}"' in source for code in codes)
+    assert codes >= set(re.findall(r'Finding\("([a-z0-9-]+)"', source))
