@@ -113,8 +113,9 @@ from endoprior.system.ray_cluster import connected
 with connected("local", print) as cluster:
     cluster.start("module", resolve_name, "colorsys:__file__")
     cluster.start("variable", os.getenv, "OMP_WAIT_POLICY")
-    for _ in range(2):
-        print(cluster.next().value)
+    values = {ended.key: ended.value for ended in (cluster.next(), cluster.next())}  # whichever ends first
+    print(values["module"])
+    print(values["variable"])
     import ray
     address = ray.get_runtime_context().gcs_address
     without = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
