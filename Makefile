@@ -6,18 +6,23 @@
 # from there, for the CPU alone: on Linux that saves most of the download (docs/install.md).
 VENV := .venv
 BIN := $(VENV)/bin
+# Two processes, because most of a first run is compiling kernels, which takes one core. Files stay together.
+QUICK := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 export PYTHON TORCH_INDEX
 
-.PHONY: demo test test-all test-faults style lint browser bench figures docs clean
+.PHONY: demo test coverage test-all test-faults style lint browser bench figures docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
 	@echo "To type endoprior without its folder: source $(BIN)/activate"
 
-# Two processes, because most of a first run is compiling kernels, which takes one core. Files stay together.
 test: $(VENV)/.test-installed style browser
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=
-	@echo "Lines run by the quick tests: $$($(BIN)/python -m coverage report --format=total) % (compiled kernels count as not run)"
+	$(QUICK)
+
+# Which lines the quick tests run; compiled kernels count as not run.
+coverage: $(VENV)/.test-installed browser
+	$(QUICK) --cov --cov-report=
+	$(BIN)/python -m coverage report --skip-covered --sort=cover
 
 # One process: slow tests start processes of their own and watch the clock.
 test-all: test
