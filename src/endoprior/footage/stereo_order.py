@@ -144,6 +144,12 @@ def right_camera(camera: Camera, baseline_mm: float) -> Camera:
     return replace(camera, world_to_camera=moved @ camera.world_to_camera)
 
 
+def share_of_right(camera: Camera, left: Camera, baseline_mm: float) -> float:
+    """How far `camera` stands from the left camera towards the right one: 0 at the left, 1 at and past the right."""
+    along = left.world_to_camera[0, :3] @ (camera.center - left.center)
+    return float(np.clip(along / baseline_mm, 0, 1))
+
+
 def warp_to_right(
     rgb: NDArray[np.floating], disparity: NDArray[np.floating], tissue: Mask
 ) -> tuple[NDArray[np.floating], Mask]:

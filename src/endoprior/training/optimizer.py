@@ -24,6 +24,7 @@ RATES = {
     "sh_dc": 2.5e-3,
     "sh_rest": 1.25e-4,
     "color_slopes": 2.5e-3,
+    "gloss": 2.5e-3,
     "opacity_logits": 5e-2,
     PLANES: 1.6e-3,
     "box": 1.6e-3,
