@@ -46,8 +46,8 @@ def test_a_camera_has_a_share_of_the_right_eye():
     turn = cv2.Rodrigues(np.array([0.2, -0.3, 0.1]))[0]
     pose = np.block([[turn, np.array([[5.0], [-2.0], [9.0]])], [np.zeros((1, 3)), np.ones((1, 1))]])
     left = Camera(64, 48, 50, 55, 30, 25, pose)
-    found = [share_of_right(right_camera(left, mm), left, BASELINE) for mm in (-3, 0, 1, 4, 20)]
-    assert np.allclose(found, [0, 0, 0.25, 1, 1])
+    found = [share_of_right(right_camera(left, mm), left, BASELINE) for mm in (-3, 0, 1, 4, 6, 20)]
+    assert np.allclose(found, [0, 0, 0.25, 1, 0.5, 0])
 
 
 def test_each_eye_sees_its_own_color(scene):

@@ -145,9 +145,9 @@ def right_camera(camera: Camera, baseline_mm: float) -> Camera:
 
 
 def share_of_right(camera: Camera, left: Camera, baseline_mm: float) -> float:
-    """How far `camera` stands from the left camera towards the right one: 0 at the left, 1 at and past the right."""
-    along = left.world_to_camera[0, :3] @ (camera.center - left.center)
-    return float(np.clip(along / baseline_mm, 0, 1))
+    """How much `camera` sees as the right camera does: 1 there, falls linearly to 0 at the distance of the left one."""
+    away = np.linalg.norm(camera.center - right_camera(left, baseline_mm).center)
+    return float(max(0, 1 - away / baseline_mm))
 
 
 def warp_to_right(
