@@ -69,7 +69,7 @@ def test_several_frames_at_once_are_the_frames(scene):
 def test_a_frame_is_deformed_once(scene, monkeypatch):
     asked = []
     original = SingleScene.at
-    monkeypatch.setattr(SingleScene, "at", lambda self, time: asked.append(time) or original(self, time))
+    monkeypatch.setattr(SingleScene, "at", lambda self, time, *eye: asked.append(time) or original(self, time, *eye))
     playback = Playback(scene)
     for i in (0, 1, 0, 1, 1):
         playback.render(i)
@@ -80,7 +80,7 @@ def test_the_frame_not_drawn_for_longest_goes_first(scene, monkeypatch):
     asked = []
     original = SingleScene.at
     monkeypatch.setattr(
-        SingleScene, "at", lambda self, time: asked.append(round(time * NUM_FRAMES)) or original(self, time)
+        SingleScene, "at", lambda self, time, *eye: asked.append(round(time * NUM_FRAMES)) or original(self, time, *eye)
     )
     one = Playback(scene)
     one.splats(0)

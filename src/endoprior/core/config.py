@@ -54,7 +54,8 @@ class DataConfig(Checked):
     """`used`: frames without a camera pose are neither trained on nor scored, and blurred, hazy or saturated ones count
     less. `ignored`: all count alike, as published."""
     eyes: Literal["left", "both"] = "left"
-    """Eyes whose pictures are trained on, in turn at random; `both` needs the right ones (docs/scores.md)."""
+    """Eyes whose pictures are trained on, in turn at random; `both` needs the right ones (docs/scores.md). Each sees
+    its own highlights, and has half of the iterations."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -144,6 +144,12 @@ def right_camera(camera: Camera, baseline_mm: float) -> Camera:
     return replace(camera, world_to_camera=moved @ camera.world_to_camera)
 
 
+def share_of_right(camera: Camera, left: Camera, baseline_mm: float) -> float:
+    """How much `camera` sees as the right camera does: 1 there, falls linearly to 0 at the distance of the left one."""
+    away = np.linalg.norm(camera.center - right_camera(left, baseline_mm).center)
+    return float(max(0, 1 - away / baseline_mm))
+
+
 def warp_to_right(
     rgb: NDArray[np.floating], disparity: NDArray[np.floating], tissue: Mask
 ) -> tuple[NDArray[np.floating], Mask]:

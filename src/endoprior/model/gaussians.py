@@ -46,6 +46,7 @@ ATTRIBUTES = (
     Attribute("sh_dc", 3, lambda cfg: cfg.kind == "basis"),
     Attribute("sh_rest", 3),
     Attribute("color_slopes", 3),
+    Attribute("gloss", 3),
 )
 """Every attribute but `motion`, the temporal coefficients of the others. The channels of `motion` and the heads of a
 HexPlane field follow this order."""
@@ -84,6 +85,10 @@ def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:
     shapes["color_slopes"] = (2, 3)
     if not cfg.render.color_slopes:
         del shapes["color_slopes"]
+    if cfg.data.eyes == "both":  # what the right eye sees more: of the color, then of its slopes
+        shapes["gloss"] = (3 if cfg.render.color_slopes else 1, 3)
+    else:
+        del shapes["gloss"]
     return shapes
 
 
@@ -126,12 +131,21 @@ class Gaussians:
         """(N,) canonical opacities in (0, 1)."""
         return self.tensors["opacity_logits"].sigmoid()
 
-    def splats(self, offsets: Offsets | None, sh_degree: int) -> Splats:
-        """Activate the parameters, moved by `offsets` (None: canonical), with color up to `sh_degree`."""
+    def splats(self, offsets: Offsets | None, sh_degree: int, right_share: float = 0.0) -> Splats:
+        """Activate the parameters, moved by `offsets` (None: canonical), with color up to `sh_degree`.
+
+        Args:
+            right_share: how far the color is that of the right eye, in [0, 1]: see `stereo_order.share_of_right`.
+        """
         t = self.tensors
         sh_dc = t["sh_dc"]
         if offsets is not None and offsets.sh_dc is not None:
             sh_dc = sh_dc + offsets.sh_dc[:, None, :]
+        color_slopes = t.get("color_slopes")
+        if right_share and "gloss" in t:
+            gloss = right_share * t["gloss"]
+            sh_dc = sh_dc + gloss[:, :1]
+            color_slopes = color_slopes if color_slopes is None else color_slopes + gloss[:, 1:]
         sh_rest = _moved(t["sh_rest"], offsets and offsets.sh_rest)
         num_rest = (sh_degree + 1) ** 2 - 1
         return Splats(
@@ -140,7 +154,7 @@ class Gaussians:
             scales=_moved(t["log_scales"], offsets and offsets.log_scales).exp(),
             opacities=_moved(t["opacity_logits"], offsets and offsets.opacity_logits).sigmoid(),
             sh=torch.cat([sh_dc, sh_rest[:, :num_rest]], 1) if num_rest else sh_dc,
-            color_slopes=t.get("color_slopes"),
+            color_slopes=color_slopes,
         )
 
 

@@ -88,7 +88,8 @@ def _refitted_scene(scene: SingleScene, frames: Iterable[Frame]) -> SingleScene:
         taken = new - old.detach()
         _take_from_neighbors(means, ~never_seen, never_seen, taken)
         new[unseen] += taken[unseen]
-    return replace(scene, gaussians=Gaussians(tensors | {"sh_dc": sh_dc, "motion": motion}))
+    tensors.pop("gloss", None)  # the right eye sees the same tissue
+    return replace(scene, gaussians=Gaussians(tensors | {"sh_dc": sh_dc, "motion": motion}), baseline_mm=0.0)
 
 
 def _free_of_highlights(scene: SingleScene, frames: Iterable[Frame]) -> tuple[NDArray[np.float32], list[float]]:

@@ -61,6 +61,8 @@ class Playback:
     def render(self, index: int, camera: Camera | None = None) -> RenderedView:
         """Render frame `index`, from `camera` or else from its own. See `Scene.render`."""
         scene = self.scene
+        if camera is not None and scene.config.data.eyes == "both":  # colors differ from camera to camera
+            return scene.render(index / len(self), camera)
         return rendered(self._parts(index), camera or scene.cameras[index], scene.backend, scene.background)
 
     @torch.no_grad()

@@ -154,12 +154,14 @@ class Scene(RenderedScene):
         return [_shown(window, position, share) for window, share in parts if share > 0]
 
     @torch.no_grad()
-    def parts_at(self, time: float) -> list[tuple[Splats, float]]:
-        """The Gaussians, activated, of each window that shows at `time` in [0, 1], and its weight."""
-        return [(part.window.scene.at(part.time), part.weight) for part in self.shown_at(time)]
+    def parts_at(self, time: float, camera: Camera | None = None) -> list[tuple[Splats, float]]:
+        """The Gaussians, activated, of each window that shows at `time` in [0, 1], and its weight; see `at`."""
+        return [(part.window.scene.at(part.time, camera), part.weight) for part in self.shown_at(time)]
 
-    def at(self, time: float) -> Splats:
+    def at(self, time: float, camera: Camera | None = None) -> Splats:
         """The Gaussians at `time`, activated. Where two windows show, those of both, each as opaque as its weight.
+
+        Their colors are those that `camera` sees, of scenes trained on both eyes; None: that the left eye sees.
 
         A ray that passes Gaussians of opacity o keeps the product of 1 - o. The opacities 1 - (1 - o) ** weight make
         that of both windows together the weighted geometric mean of the two. `render` is sharper there: it mixes the
@@ -168,12 +170,13 @@ class Scene(RenderedScene):
         Raises:
             ValueError: time is not in [0, 1].
         """
-        return joined([faded(splats, weight) for splats, weight in self.parts_at(time)])
+        return joined([faded(splats, weight) for splats, weight in self.parts_at(time, camera)])
 
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """See `RenderedScene.render`; where two windows show, the weighted mean of the pictures of both."""
-        return rendered(self.parts_at(time), camera or self.camera_at(time), self.backend, self.background)
+        seen_by = camera or self.camera_at(time)
+        return rendered(self.parts_at(time, seen_by), seen_by, self.backend, self.background)
 
     def smoke_at(self, time: float) -> Tensor | None:
         """See `RenderedScene.smoke_at`."""
@@ -187,7 +190,8 @@ class Scene(RenderedScene):
     @torch.no_grad()
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
         """`render` at several times, in one call where the backend can, of cameras of one size: faster on a GPU."""
-        return rendered_many([self.parts_at(time) for time in times], cameras, self.backend, self.background)
+        parts = [self.parts_at(time, camera) for time, camera in zip(times, cameras, strict=True)]
+        return rendered_many(parts, cameras, self.backend, self.background)
 
     @cached_property
     def method(self) -> Method:

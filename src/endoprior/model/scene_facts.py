@@ -36,6 +36,7 @@ class SceneFacts(Checked):
     lengths_are_relative: bool = False
     trained_from: Annotated[float, Range(0, 1)] = 0.0
     trained_until: Annotated[float, Range(0, 1)] = 1.0
+    baseline_mm: Annotated[float, Range(0, 1e6)] = 0.0
     smoke: bool = False
 
     def __post_init__(self) -> None:

@@ -61,7 +61,10 @@ def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a scene's file of this description; `T` frames."""
     cfg = config_from(about["config"])
     smoke = {"smoke": ArraySpec("float32", ("T", *GRID, 2))} if about.get("smoke") else {}
-    return method_of(cfg).schema(cfg) | CAMERAS | smoke
+    shapes = method_of(cfg).schema(cfg) | CAMERAS | smoke
+    if not about.get("baseline_mm"):  # a scene of both eyes from before there was gloss
+        shapes.pop("gaussians.gloss", None)
+    return shapes
 
 
 def index_schema(_about: dict[str, Any]) -> dict[str, ArraySpec]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from .. import render
 from ..core.config import Config
 from ..core.types import Camera, Splats
+from ..footage.stereo_order import share_of_right
 from ..system.arrays_file import part, save_arrays
 from .gaussians import Gaussians
 from .motion import Field, Motion, Offsets
@@ -46,6 +47,8 @@ class SingleScene(Scene):
     trained_until: float = 1.0
     """... and after this one too: a temporal basis that nothing holds leads anywhere."""
     rendered_by: render.Backend | None = None
+    baseline_mm: float = 0.0
+    """From the left to the right camera, where both were trained on: what `gloss` is seen from; 0: from nowhere."""
     smoke: Tensor | None = None
     """(T, I, J, 2) gain and veil of each frame: see `photometric`; None: no smoke."""
 
@@ -58,15 +61,18 @@ class SingleScene(Scene):
         return (Window(0, len(self.cameras), lambda: self),)
 
     @torch.no_grad()
-    def at(self, time: float) -> Splats:
+    def at(self, time: float, camera: Camera | None = None) -> Splats:
         """See `Scene.at`."""
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
-        return self._splats(self.offsets(self.gaussians, time))
+        share = 0.0
+        if camera is not None and self.baseline_mm:
+            share = share_of_right(camera, self.camera_at(time), self.baseline_mm)
+        return self._splats(self.offsets(self.gaussians, time), share)
 
-    def parts_at(self, time: float) -> list[tuple[Splats, float]]:
+    def parts_at(self, time: float, camera: Camera | None = None) -> list[tuple[Splats, float]]:
         """See `Scene.parts_at`."""
-        return [(self.at(time), 1.0)]
+        return [(self.at(time, camera), 1.0)]
 
     def offsets(self, gaussians: Gaussians, time: float) -> Offsets:
         """Deformation of some Gaussians of the scene at `time` in [0, 1]."""
@@ -83,8 +89,8 @@ class SingleScene(Scene):
         """The Gaussians as they are stored, before any motion, activated."""
         return self._splats(None)
 
-    def _splats(self, offsets: Offsets | None) -> Splats:
-        found = self.gaussians.splats(offsets, self.config.schedule.sh_degree)
+    def _splats(self, offsets: Offsets | None, right_share: float = 0.0) -> Splats:
+        found = self.gaussians.splats(offsets, self.config.schedule.sh_degree, right_share)
         # A tensor that no deformation changes is the trained tensor itself, with its gradient.
         return Splats(**{name: value.detach() for name, value in found.tensors.items()})
 
@@ -141,6 +147,7 @@ class SingleScene(Scene):
             facts.lengths_are_relative,
             facts.trained_from,
             facts.trained_until,
+            baseline_mm=facts.baseline_mm,
             smoke=arrays.get("smoke"),
         )
 
@@ -154,6 +161,8 @@ class SingleScene(Scene):
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         about: dict[str, Any] = {"trained_from": self.trained_from, "trained_until": self.trained_until}
+        if self.baseline_mm:
+            about["baseline_mm"] = self.baseline_mm
         if self.smoke is not None:
             arrays["smoke"], about["smoke"] = self.smoke, True
         save_arrays(path, arrays, scene_facts(self) | about, FORMAT)

@@ -217,7 +217,7 @@ class GaussianTrainer(Trainer):
     def scene(self) -> SingleScene:
         """See `Trainer.scene`."""
         state, trained, num = self.state, self.step_once.frames.indices, len(self.sequence)
-        holds = self.motion.stays_at_the_ends
+        holds, eye = self.motion.stays_at_the_ends, self.sequence.right_eye
         return SingleScene(
             gaussians=state.gaussians.to("cpu"),
             field=state.field and state.field.to("cpu"),
@@ -229,5 +229,6 @@ class GaussianTrainer(Trainer):
             lengths_are_relative=self.sequence.depth_is_relative,
             trained_from=trained[0] / num if holds else 0.0,
             trained_until=trained[-1] / num if holds else 1.0,
+            baseline_mm=eye.baseline_mm if eye and self.cfg.data.eyes == "both" else 0.0,
             smoke=None if self.smoke is None else of_all_frames(torch.from_numpy(self.smoke), trained, num),
         )

@@ -24,6 +24,7 @@ RATES = {
     "sh_dc": 2.5e-3,
     "sh_rest": 1.25e-4,
     "color_slopes": 2.5e-3,
+    "gloss": 2.5e-3,
     "opacity_logits": 5e-2,
     PLANES: 1.6e-3,
     "box": 1.6e-3,
@@ -34,8 +35,8 @@ FINAL_SHARE = 0.01  # of the rates of centers, network and planes, left at `deca
 BASIS_OPACITY_LR = 2e-2  # rate of the temporal coefficients of opacities
 BASIS_DECAY = 0.1  # share of the rates of temporal coefficients left at `decay_iterations`; log-linear in between
 EPSILON, BASIS_EPSILON = 1e-15, 1e-7
-"""Adam's epsilon, and that for temporal coefficients: else the faint gradient that leaks to what tools hide would move
-it as fast as any other."""
+"""Adam's epsilon, and that for temporal coefficients and gloss: else the faint gradient that leaks to what tools hide
+would move it as fast as any other."""
 LATE = 0.75  # share of `decay_iterations` after which the rates without a final value begin to fall
 
 
@@ -95,12 +96,13 @@ class Optimizer:
             iteration: 1-based, within the stage.
             skip: () float32 on a device; where it is 1 the gradients are only cleared.
         """
-        by_rate: dict[float, list[tuple[AdamState, Tensor]]] = defaultdict(list)
+        groups: dict[tuple[float, float], list[tuple[AdamState, Tensor]]] = defaultdict(list)
         for name, param in self._dense().items():
             if param.grad is not None and param.numel():
-                by_rate[self.rates[name](iteration)].append((self.states[name], param))
-        for rate, group in by_rate.items():
-            self._ops.adam_step([state for state, _ in group], [param for _, param in group], rate, EPSILON, skip)
+                epsilon = BASIS_EPSILON if name == "gloss" else EPSILON
+                groups[self.rates[name](iteration), epsilon].append((self.states[name], param))
+        for (rate, epsilon), group in groups.items():
+            self._ops.adam_step([state for state, _ in group], [param for _, param in group], rate, epsilon, skip)
         if self.gaussians.motion_gradients and len(self.gaussians):
             self._step_motion(iteration, skip)
         if self.planes and self.field and any(param.grad is not None for param in self.field.parameters.values()):

@@ -159,7 +159,7 @@ class TrainingStep:
             means_before = means + displacement
         elif fine:
             offsets = self.motion.offsets(gaussians, state.field, frame.time, cfg, model_ops)
-        splats = gaussians.splats(offsets, sh_degree(cfg, state.stage, iteration))
+        splats = gaussians.splats(offsets, sh_degree(cfg, state.stage, iteration), float(is_right))
 
         render = partial(
             self.rasterize,
