@@ -103,6 +103,19 @@ def test_what_stays_on_the_lens_is_not_followed_where_corners_are_few():
     assert np.mean(np.abs(found[1] - corners[found[0]]).max(1) < 1) < 0.02
 
 
+def test_a_border_does_not_hold_corners_where_they_are():
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    tissue, views = np.hypot(x - SIZE[0] / 2, y - SIZE[1] / 2) < 0.45 * SIZE[1], []
+    for shift in (0.0, 4.0):
+        gray = 70 + 0.5 * (shifted(soft(1), (shift, 0))[0] - 128.0) + 30 * x / SIZE[0]
+        image = np.where(tissue, gray, 0).astype(np.uint8)
+        views.append(view_of(PoseInput(color(image), tissue, np.full(SIZE[::-1], 70, np.float32))))
+    corners = new_corners(views[0], np.zeros((0, 2), np.float32))
+    kept, there = followed(*views, corners)
+    way = there[:, 0] - corners[kept][:, 0]
+    assert len(kept) > 100 and np.mean(way < 1.2) < 0.02 and np.mean(np.abs(way - 4) < 0.5) > 0.8
+
+
 def path_of(step, turn_degrees=0.0):
     """A path of 20 frames with one way (3,) and one turn a step, and tracks at 50 mm."""
     pose, motion = np.eye(4), np.eye(4)

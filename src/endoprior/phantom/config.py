@@ -37,8 +37,9 @@ def _require(name: str, value: float, low: float, high: float) -> None:
 class PhantomConfig:
     """A synthetic operation: breathing bowel under a liver edge, a grasper that pulls it, a second moving tool."""
 
-    scene: Literal["cavity", "tube"] = "cavity"
-    """`tube`: instead, the camera drives forward through a bent tube with folds, as a colon, without tools."""
+    scene: Literal["cavity", "tube", "sinus"] = "cavity"
+    """`tube`: instead, the camera drives forward through a bent tube with folds, as a colon, without tools; `sinus`: in
+    and out of a narrow nasal cavity."""
     frames: int = 48
     """Number of frames, 2..10000. The tool grasps, pulls and releases about once every 48 frames."""
     width: int = 640
@@ -117,7 +118,7 @@ class PhantomConfig:
             if getattr(self, name) not in known:
                 raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
         parse_events(self.events, self.frames)
-        if self.scene == "tube":
+        if self.scene != "cavity":
             self._require_no_cavity()
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
@@ -138,11 +139,13 @@ class PhantomConfig:
     def _require_no_cavity(self) -> None:
         """Raise InputError if an option is set that belongs to the other scene."""
         kept = ("scene", "frames", "width", "height", "seed", "baseline_mm", "focal_per_width", "principal_x")
-        kept += ("principal_y", "frames_per_second", "noise", "depth_noise_px", "tracks")
+        kept += ("principal_y", "frames_per_second", "noise", "depth_noise_px", "tracks", "border")
         for field in fields(self):
             if field.name not in kept and getattr(self, field.name) != field.default:
                 option = "--" + field.name.replace("_", "-")
-                raise input_error("--scene tube", f"no {option}, which belongs to `cavity`", "one", f"Remove {option}.")
+                raise input_error(
+                    f"--scene {self.scene}", f"no {option}, which belongs to `cavity`", "one", f"Remove {option}."
+                )
 
     @property
     def has_regions(self) -> bool:

@@ -17,8 +17,9 @@ from .config import PhantomConfig
 from .events import Event, disturbed, is_mirrored, parse_events, shows_body
 from .scene import Moment, Scene, build_scene
 from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth, vignette
+from .sinus import build_sinus
 from .texture import smooth_patches
-from .tube import write_tube
+from .tube import build_tube, write_tube
 from .views import pixel_hits, render_view, shown_elsewhere, side_eyes, side_view, visible_points
 
 Mask = NDArray[np.bool_]
@@ -125,7 +126,7 @@ def write_phantom(
       first frame and shows the smoke of `cfg.tissue`, not that of `cfg.smoke`; the side cameras see none;
     - with `cfg.border` `truth/border.npy`, (H, W) bool, True outside; with `cfg.overlay` `truth/overlay/*.npy`, True
       on the drawing;
-    - of the scene `tube` only tissue, depth, tracks and the camera's poses;
+    - of the scenes `tube` and `sinus` only tissue, depth, tracks and the camera's poses;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
 
     Args:
@@ -135,14 +136,16 @@ def write_phantom(
         InputError: `out` is in use.
     """
     with new_sequence(out, _meta(cfg)) as writer:
-        if cfg.scene == "tube":
-            write_tube(writer, cfg, progress)
+        outside = border(cfg)
+        if cfg.border != "none":
+            writer.write_array("truth/border.npy", outside)
+        if cfg.scene != "cavity":
+            tube = build_tube(cfg) if cfg.scene == "tube" else build_sinus(cfg)
+            write_tube(writer, tube, cfg, outside, progress)
             return
         scene = build_scene(cfg)
         tracked = choose_tracks(scene)
-        lens, outside = vignette(cfg.width, cfg.height), border(cfg)
-        if cfg.border != "none":
-            writer.write_array("truth/border.npy", outside)
+        lens = vignette(cfg.width, cfg.height)
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
         points, visible, gains, sides, gain, first_gain, wanted = [], [], [], {}, 0.0, 0.0, 0.0
@@ -264,7 +267,7 @@ def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye],
 def _meta(cfg: PhantomConfig) -> SequenceMeta:
     """What `sequence.json` says."""
     kinds = f", instruments {cfg.instruments}, tissue {cfg.tissue}" if cfg.has_kinds else ""
-    kinds += ", scene tube" if cfg.scene == "tube" else ""
+    kinds += f", scene {cfg.scene}" if cfg.scene != "cavity" else ""
     made = f"synthetic (endoprior phantom, seed {cfg.seed}{kinds})"
     return SequenceMeta(
         width=cfg.width,

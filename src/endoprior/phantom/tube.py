@@ -1,7 +1,8 @@
 """A bent tube with folds, as a colon or a bronchus, through which the camera drives forward with the lamp beside it.
 
-The tube is rigid, without tools. Letters: (MH, MW) mesh, rows along the tube and columns around it; s is the arc length
-along its center line, a the one around its wall, mm. World axes are those of the camera in frame 0.
+It is rigid, without tools; `sinus` has another shape of the same. Letters: (MH, MW) mesh, rows along the tube and
+columns around it; s is the arc length along its center line, a the one around its wall, mm. World axes are those of the
+camera in frame 0.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _COLORS = (0.78, 0.44, 0.36), (0.90, 0.64, 0.50), (0.55, 0.16, 0.14)  # display 
 
 @dataclass(frozen=True)
 class Tube:
-    """What is static in one synthetic drive."""
+    """What is static in one synthetic drive: of the scene `tube`, or of `sinus`."""
 
     vertices: NDArray[np.float64]  # (MH, MW, 3) mm, in world axes
     texture: NDArray[np.float32]  # (TH, TW, 7) material maps, as `texture.build_texture` has them
@@ -49,10 +50,13 @@ def build_tube(cfg: PhantomConfig) -> Tube:
     radius = _radius(s, angle, length, cfg.seed, rng)
     ring = np.cos(angle)[:, None] * frames[:, None, 0] + np.sin(angle)[:, None] * frames[:, None, 1]
     vertices = center[:, None] + radius[..., None] * ring
-    poses = _drive(cfg, s, center, frames, rng)
+    return from_first_frame(vertices, wall_texture(length, around, cfg.seed), _drive(cfg, s, center, frames, rng))
+
+
+def from_first_frame(vertices: NDArray, texture: NDArray, poses: NDArray) -> Tube:
+    """A tube whose world becomes the axes of the camera in frame 0."""
     start = np.linalg.inv(poses[0])
-    vertices = vertices @ start[:3, :3].T + start[:3, 3]
-    return Tube(vertices, _texture(length, around, cfg.seed), start @ poses)
+    return Tube(vertices @ start[:3, :3].T + start[:3, 3], texture, start @ poses)
 
 
 def _center_line(s: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
@@ -72,26 +76,30 @@ def _radius(s: NDArray, angle: NDArray, length: float, seed: int, rng: np.random
         at, lobe = at + rng.uniform(-5, 5), rng.uniform(0, 2 * np.pi)
         reach = 0.7 + 0.3 * np.cos(3 * angle + lobe)
         folds += np.exp(-(((s - at) / FOLD_WIDTH_MM) ** 2))[:, None] * reach
-    swell = _around(angle[None] * RADIUS_MM, s[:, None], 2 * np.pi * RADIUS_MM, 17.0, 2, seed + 200)
+    swell = smooth_around(angle[None] * RADIUS_MM, s[:, None], 2 * np.pi * RADIUS_MM, 17.0, 2, seed + 200)
     radius = RADIUS_MM * (1 - FOLD_DEPTH * folds + 0.06 * swell)
     return radius * np.sqrt(np.clip((length - MESH_MM - s) / 12, 1e-8, 1))[:, None]
 
 
-def _around(a: NDArray, s: NDArray, around: float, scale: float, octaves: int, seed: int) -> NDArray[np.float32]:
-    """Smooth noise without a seam: two fields that fade into one another once around the tube."""
+def smooth_around(a: NDArray, s: NDArray, around: float, scale: float, octaves: int, seed: int) -> NDArray[np.float32]:
+    """Smooth noise at (a, s), mm, without a seam: two fields that fade into one another once around the tube."""
     a, s = np.broadcast_arrays(a, s)
     share = (a / around).astype(np.float32)
     first, second = (fractal((a - by) / scale, s / scale, octaves, seed) for by in (0, around))
     return np.asarray(((1 - share) * first + share * second) / np.hypot(1 - share, share), np.float32)
 
 
-def _texture(length: float, around: float, seed: int) -> NDArray[np.float32]:
-    """Color with vessels; the mesh has all relief."""
-    rows, columns = round(length * TEXELS_PER_MM), round(around * TEXELS_PER_MM)
+def wall_texture(
+    length: float, around: float, seed: int, *, fine: float = 1.0, contrast: float = 1.0, gloss: float = 0.5
+) -> NDArray[np.float32]:
+    """(TH, TW, 7) color with vessels of a wall with these sides, mm, whose detail is so many times as `fine`; the mesh
+    has all relief.
+    """
+    rows, columns = (round(side * fine * TEXELS_PER_MM) for side in (length, around))
     s, a = ((np.arange(n, dtype=np.float32) + 0.5) / TEXELS_PER_MM for n in (rows, columns))
 
     def noise(scale: float, octaves: int, more: int) -> NDArray[np.float32]:
-        return _around(a[None], s[:, None], around, scale, octaves, seed + more)
+        return smooth_around(a[None], s[:, None], around * fine, scale, octaves, seed + more)
 
     wall, pale, blood = (np.array(color, np.float32) ** np.float32(2.2) for color in _COLORS)
     mottle = np.clip(0.45 + 0.8 * noise(9.0, 3, 210) + 0.5 * noise(1.6, 3, 211), 0, 1)
@@ -100,8 +108,9 @@ def _texture(length: float, around: float, seed: int) -> NDArray[np.float32]:
     )
     color = wall + mottle[..., None] * (pale - wall)
     color += (0.75 * vessels * np.clip(0.8 + 1.2 * noise(20.0, 1, 214), 0, 1))[..., None] * (blood - color)
+    color = wall + contrast * (color - wall)
     out = np.zeros((rows, columns, CHANNELS), np.float32)
-    out[..., :3], out[..., 5], out[..., 6] = color, 0.5, 1.0
+    out[..., :3], out[..., 5], out[..., 6] = color, gloss, 1.0
     return out
 
 
@@ -129,27 +138,31 @@ def _drive(
     return poses
 
 
-def write_tube(writer: FrameFiles, cfg: PhantomConfig, progress: Callable[[int, int], None] | None) -> None:
-    """Write frames and truth: `truth/tissue`, `truth/depth`, `truth/camera_to_world.npy` and `truth/tracks.npz`, as
-    `write_phantom` does.
+def write_tube(
+    writer: FrameFiles,
+    tube: Tube,
+    cfg: PhantomConfig,
+    outside: NDArray[np.bool_],
+    progress: Callable[[int, int], None],
+) -> None:
+    """Write frames, black and without depth `outside` (H, W), and truth of a tube: `truth/tissue`, `truth/depth`,
+    `truth/camera_to_world.npy` and `truth/tracks.npz`, as `write_phantom` does.
     """
-    tube, lens, gain = build_tube(cfg), vignette(cfg.width, cfg.height), 0.0
-    no_tool = np.zeros((cfg.height, cfg.width), bool)
+    lens, gain = vignette(cfg.width, cfg.height), 0.0
     points, visible, tracked = [], [], _tracks(tube, cfg)
     for index, pose in enumerate(tube.poses):
         seen = Eye(pose[:3, 3], pose[:3, :3]).sees(tube.vertices)
         radiance, z = _rendered(seen, tube.texture, cfg)
         gain = gain or exposure_gain(radiance)
         rng = np.random.default_rng([cfg.seed, 6, index])
-        image = expose(develop(radiance, gain, lens), cfg.noise, rng)
+        image = np.where(outside[..., None], np.uint8(0), expose(develop(radiance, gain, lens), cfg.noise, rng))
         writer.write_image("truth/tissue", np.round(develop(radiance, gain, lens)).astype(np.uint8))
         writer.write_array(f"truth/depth/{index:06d}.npy", z)
         at = seen[tracked[:, 0], tracked[:, 1]]
         points.append(at)
-        visible.append(visible_points(at, z, no_tool, cfg))
-        writer.add(image, no_tool, stereo_depth(z, image, cfg, rng))
-        if progress is not None:
-            progress(index + 1, cfg.frames)
+        visible.append(visible_points(at, z, outside, cfg))
+        writer.add(image, outside, np.where(outside, np.float32(0), stereo_depth(z, image, cfg, rng)))
+        progress(index + 1, cfg.frames)
     tracks = {"points": np.stack(points).astype(np.float32), "visible": np.stack(visible)}
     writer.write_arrays("truth/tracks.npz", **tracks)
     writer.camera_to_world = tube.poses

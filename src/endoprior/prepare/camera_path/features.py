@@ -22,6 +22,9 @@ REFRESH = 0.8  # new corners are detected when fewer than this share of `MAX_COR
 EDGE_STEP = 0.05  # no corners where depth changes by more than this share between neighbors: those are depth edges
 CELLS = (8, 6)  # columns and rows of the image; no cell holds more than twice its share of the corners
 FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0  # shading is left by a blur of width / 64 px; contrast of the rest, gray levels
+EDGE_PX, FADE_WIDTHS = 3.0, 32
+"""Tissue fades out over width / 32 px before a border or a tool, whose outlines would hold corners where they are;
+beyond, there is a blur of it. Corners are where more than half is left."""
 COARSE_HALVINGS, FINE_HALVINGS = 4, 1  # how often images are halved to follow corners: plain images, then flat ones
 FINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
 FINE_PX = 2.0  # the two results differ by less than this
@@ -49,14 +52,24 @@ class View:
 def view_of(seen: PoseInput, *, coarse: bool = False) -> View:
     """Prepare a frame. Args: coarse: whether corners are few, so that larger detail is followed."""
     plain = np.asarray(cv2.cvtColor(seen.rgb_u8, cv2.COLOR_RGB2GRAY), np.uint8)
+    width, usual = plain.shape[1], float(np.median(plain))
+    inside_px = cv2.distanceTransform(seen.tissue_mask.astype(np.uint8), cv2.DIST_L2, 5) - EDGE_PX
+    tissue = np.clip(inside_px / (width / FADE_WIDTHS), 0, 1).astype(np.float32)
+    plain = np.where(tissue > 0, plain, _smooth(plain, tissue, width / FADE_WIDTHS, usual)).astype(np.uint8)
     if coarse:
-        plain = np.asarray(cv2.GaussianBlur(plain, (0, 0), plain.shape[1] / BLUR_WIDTHS), np.uint8)
+        plain = np.asarray(cv2.GaussianBlur(plain, (0, 0), width / BLUR_WIDTHS), np.uint8)
     bright = np.log(plain.astype(np.float32) + 8)
-    widths = COARSE_FLAT_WIDTHS if coarse else FLAT_WIDTHS
-    bright -= cv2.GaussianBlur(bright, (0, 0), max(plain.shape[1] / widths, 2.0))
+    sigma = max(width / (COARSE_FLAT_WIDTHS if coarse else FLAT_WIDTHS), 2.0)
+    bright = (bright - _smooth(bright, tissue, sigma, 0.0)) * tissue
     flat = np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8)
     measured = np.isfinite(seen.depth) & (seen.depth > 0)
-    return View(plain, flat, usable_tissue(seen), np.where(measured, seen.depth, np.float32(0)))
+    return View(plain, flat, usable_tissue(seen) & (tissue > 0.5), np.where(measured, seen.depth, np.float32(0)))
+
+
+def _smooth(image: NDArray, weight: NDArray[np.float32], sigma: float, far: float) -> NDArray[np.float32]:
+    """(H, W) blur of what has weight (H, W); `far` where that is many sigma away."""
+    total, share = (cv2.GaussianBlur(part, (0, 0), sigma) for part in ((image - np.float32(far)) * weight, weight))
+    return np.asarray(total / np.maximum(share, np.float32(1e-3)) + np.float32(far), np.float32)
 
 
 def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
