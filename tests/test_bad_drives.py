@@ -64,6 +64,7 @@ def test_without_flock_only_the_lock_of_a_dead_process_of_this_machine_is_free(t
         pass
 
 
+@pytest.mark.slow
 def test_a_training_works_without_flock(tiny_sequence, tmp_path, monkeypatch):
     without_flock(monkeypatch, "ENOLCK")
     cfg, out = tiny_config("basis", coarse=1, fine=2), tmp_path / "out"

@@ -158,6 +158,7 @@ def test_where_there_is_no_smoke_training_is_bit_identical(tiny_sequence):
     assert losses_of(tiny_sequence, config("auto")) == losses_of(tiny_sequence, config("none"))
 
 
+@pytest.mark.slow
 def test_stop_and_resume_equals_uninterrupted(smoky, tmp_path):
     sequence, cfg = load_sequence(smoky[0]), config()
     whole = train(sequence, cfg, tmp_path / "whole")

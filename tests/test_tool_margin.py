@@ -232,6 +232,7 @@ def test_training_leaves_the_pixels_out(tiny_sequence):
         assert counted.num_measured == counted.measured.sum()
 
 
+@pytest.mark.slow
 def test_their_colors_do_not_matter(make_tiny_sequence):
     """Two clips that differ in nothing else give the same Gaussians, without a prior, which looks at neighbors."""
     cfg = replace(
