@@ -55,7 +55,9 @@ def view_of(seen: PoseInput, *, coarse: bool = False) -> View:
     width, usual = plain.shape[1], float(np.median(plain))
     inside_px = cv2.distanceTransform(seen.tissue_mask.astype(np.uint8), cv2.DIST_L2, 5) - EDGE_PX
     tissue = np.clip(inside_px / (width / FADE_WIDTHS), 0, 1).astype(np.float32)
-    plain = np.where(tissue > 0, plain, _smooth(plain, tissue, width / FADE_WIDTHS, usual)).astype(np.uint8)
+    if (tissue <= 0).any():
+        filled = np.where(tissue > 0, plain, _smooth(plain, tissue, width / FADE_WIDTHS, usual))
+        plain = filled.astype(np.uint8)
     if coarse:
         plain = np.asarray(cv2.GaussianBlur(plain, (0, 0), width / BLUR_WIDTHS), np.uint8)
     bright = np.log(plain.astype(np.float32) + 8)
