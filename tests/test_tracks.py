@@ -118,6 +118,34 @@ def test_anchors_are_the_middles_of_equal_parts():
     assert tracks.anchors(42) == [5, 15, 26, 36]
 
 
+@pytest.mark.parametrize(("largest", "limit"), [(0.4, 0.25), (0.8, 0.4), (4, 0.6), (np.inf, 0.6)])
+def test_the_limit_rises_where_flow_closes_badly_but_not_for_ever(largest, limit):
+    errors = np.full((1, 101), np.inf) if largest == np.inf else np.linspace(0, largest, 101)[None]
+    assert tracks.cycle_limit(errors.astype(np.float32)) == pytest.approx(limit)
+
+
+def test_poor_images_lose_fewer_points_than_a_fixed_limit_would(monkeypatch):
+    """In noise few points close within a quarter of a pixel, and those that close a little worse are hardly wrong."""
+    frames = moving_frames((2.0, -1.0))
+    rng = np.random.default_rng(0)
+    noisy = [
+        replace(f, rgb_u8=(f.rgb_u8 + rng.normal(0, 60, f.rgb_u8.shape)).clip(0, 255).astype(np.uint8)) for f in frames
+    ]
+    cloud = cloud_at([(x + 0.5, y + 0.5) for x in range(40, 120, 8) for y in range(40, 90, 8)], 3, frames[0].camera)
+    start = project(cloud.points.astype(np.float64), frames[0].camera)[0]
+    truth = start + np.array([2.0, -1.0]) * (np.arange(NUM_FRAMES)[:, None, None] - 3)
+
+    def kept() -> tuple[float, float]:
+        pixels = followed(noisy, cloud)
+        found = np.isfinite(pixels[..., 0])
+        return found.mean(), np.median(np.linalg.norm(pixels - truth, axis=-1)[found])
+
+    adapted = kept()
+    monkeypatch.setattr(tracks, "CYCLE_PX", (0.25, 0.25))
+    fixed = kept()
+    assert adapted[0] > 1.3 * fixed[0] and adapted[1] < 0.6
+
+
 def test_a_step_agrees_with_arrays():
     """Against the same rule written with `bilinear`, on rough flow of half the size, on and off the image."""
     rng = np.random.default_rng(0)

@@ -39,8 +39,10 @@ from .sampling import PointCloud, has_surface
 SPACING = 14  # largest number of frames between two anchors. With 6 the tracks of the phantoms are no better.
 LEAST_ANCHORS = 4  # also of a short sequence: a point that is hidden in one anchor is followed by way of another
 REACH = 48  # frames to both sides of an anchor to which flow is computed
-CYCLE_PX = 0.25
-"""A point is lost where forward and backward flow of its two steps disagree by more than this, px of the flow."""
+CYCLE_PX, CYCLE_SHARE = (0.25, 0.6), 0.5
+"""A point is lost where forward and backward flow of its two steps disagree by more than a limit, px of the flow: that
+which keeps this share of all points and frames, within these bounds. Poor images close worse, and the few of their
+points that close well are too few to carry the rest."""
 ANCHOR_BYTES = 8 * (2 * REACH + 1)  # memory per pixel of the flows of one anchor, bytes
 RIDGE = 1e-5  # ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1
 Flow = NDArray[np.float16]
@@ -103,12 +105,19 @@ def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.i
     with ThreadPoolExecutor(workers(ANCHOR_BYTES * grays[0].size)) as pool:
         neighbors = list(pool.map(lambda k: neighbor_flows(grays, k), range(len(frames) - 1)))
         for flow in pool.map(lambda anchor: anchor_flow(grays, neighbors, anchor), anchors(len(frames))):
-            _add_tracks(flow, masks, sources, origins, CYCLE_PX * shrink, pixels, error)
+            _add_tracks(flow, masks, sources, origins, CYCLE_PX[1] * shrink, pixels, error)
+    pixels[error > cycle_limit(error / shrink) * shrink] = np.nan
     for t, frame in enumerate(frames):
         rigid, _ = project(points, frame.camera)
         pixels[t, stuck(pixels[t] - sources, rigid - sources, masks[t].shape[1])] = np.nan
     pixels[origins, np.arange(len(points))] = sources
     return pixels
+
+
+def cycle_limit(error: NDArray[np.floating]) -> float:
+    """Up to which of the errors (T, N), px of the flow and infinite where no anchor leads, a point is not lost."""
+    middle = int(CYCLE_SHARE * error.size)
+    return float(np.clip(np.partition(error.ravel(), middle)[middle], *CYCLE_PX))
 
 
 def anchors(count: int) -> list[int]:
