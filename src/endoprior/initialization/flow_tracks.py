@@ -106,7 +106,7 @@ def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.i
         neighbors = list(pool.map(lambda k: neighbor_flows(grays, k), range(len(frames) - 1)))
         for flow in pool.map(lambda anchor: anchor_flow(grays, neighbors, anchor), anchors(len(frames))):
             _add_tracks(flow, masks, sources, origins, CYCLE_PX[1] * shrink, pixels, error)
-    pixels[error > cycle_limit(error / shrink) * shrink] = np.nan
+    pixels[error > cycle_limit_px(error / shrink) * shrink] = np.nan
     for t, frame in enumerate(frames):
         rigid, _ = project(points, frame.camera)
         pixels[t, stuck(pixels[t] - sources, rigid - sources, masks[t].shape[1])] = np.nan
@@ -114,10 +114,14 @@ def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.i
     return pixels
 
 
-def cycle_limit(error: NDArray[np.floating]) -> float:
-    """Up to which of the errors (T, N), px of the flow and infinite where no anchor leads, a point is not lost."""
-    middle = int(CYCLE_SHARE * error.size)
-    return float(np.clip(np.partition(error.ravel(), middle)[middle], *CYCLE_PX))
+def cycle_limit_px(error_px: NDArray[np.floating]) -> float:
+    """The largest error with which a point is not lost, px of the flow, within `CYCLE_PX`.
+
+    Args:
+        error_px: (T, N) px of the flow by which points miss their start; infinite where no anchor leads.
+    """
+    middle = int(CYCLE_SHARE * error_px.size)
+    return float(np.clip(np.partition(error_px.ravel(), middle)[middle], *CYCLE_PX))
 
 
 def anchors(count: int) -> list[int]:
