@@ -17,7 +17,7 @@ from endoprior.model.gaussians import create_gaussians
 from endoprior.model.motion import basis_offsets, basis_weights
 from endoprior.model.ops import NUMBA
 from endoprior.model.presets import preset
-from endoprior.training.step import limit_scales
+from endoprior.training.step import MAX_SCALE_SHARE, largest_share, limit_scales
 
 WIDTH, HEIGHT = 160, 120
 
@@ -131,6 +131,23 @@ def test_scales_are_limited_by_the_distance_to_the_camera() -> None:
     for n in range(2):
         largest = math.log(0.02 * np.linalg.norm(means[n].numpy() - cam.center))
         torch.testing.assert_close(log_scales[n], before[n].clamp(max=largest))
+
+
+def test_gaussians_stay_as_flat_as_they_start() -> None:
+    cam = camera()
+    log_scales = torch.tensor([[1.0, 0.5, 0.6], [0.5, 1.0, -4.0], [2.0, 3.0, 4.0]])
+    limit_scales(log_scales, torch.tensor([[0.0, 0.0, 1e4]]).expand(3, 3), cam, 1.0, 0.3)
+    thin = math.log(0.3)
+    torch.testing.assert_close(log_scales[:, 2], torch.tensor([0.5 + thin, -4.0, 2.0 + thin]))
+    torch.testing.assert_close(log_scales[:, :2], torch.tensor([[1.0, 0.5], [0.5, 1.0], [2.0, 3.0]]))
+
+
+def test_few_gaussians_may_be_as_large_as_they_are_apart() -> None:
+    cam = camera()
+    num = 4
+    spacing_px = math.sqrt(cam.width * cam.height / num)
+    assert largest_share(cam, num) == pytest.approx(spacing_px / cam.fx)
+    assert largest_share(cam, 10_000_000) == MAX_SCALE_SHARE
 
 
 def test_a_gaussian_in_the_camera_stays_finite() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from .gaussian_trainer import GaussiansState
 
 RESET_OPACITY = 0.01  # where methods that reset opacities lower them to (3DGS)
-MAX_SCALE_SHARE = 0.025
+MAX_SCALE_SHARE = 0.012
 """Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned."""
 
 
@@ -229,7 +230,8 @@ class TrainingStep:
         state.optimizer.step(drawn.iteration, self.check.skip)
         if self.cfg.deformation.max_scale_change > 1:
             log_scales = state.gaussians["log_scales"].detach()
-            limit_scales(log_scales, drawn.splats.means, drawn.frame.camera, MAX_SCALE_SHARE)
+            camera, init = drawn.frame.camera, self.cfg.init
+            limit_scales(log_scales, drawn.splats.means, camera, largest_share(camera, init.budget), init.thickness)
 
     def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
         planned = self.method.plan(state.stats, state.gaussians, self.extent, state.stage, iteration, self.cfg)
@@ -261,15 +263,29 @@ def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
     return min(done, cfg.schedule.sh_degree)
 
 
-def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float) -> None:
-    """Lower `log_scales` in place to the log of `share` of the distance to the camera.
+def largest_share(camera: Camera, num_first: int) -> float:
+    """Largest canonical scale as a share of the distance to `camera`.
 
-    A Gaussian that spans much of the picture costs the loss nothing where the camera looks from, and hangs before the
-    tissue as soon as the camera turns. Called after every step with the camera of its frame: the nearest one decides.
+    `MAX_SCALE_SHARE`, but as large as `num_first` Gaussians are apart that fill its image: fewer must be larger.
+    """
+    spacing_px = math.sqrt(camera.width * camera.height / num_first)
+    return max(MAX_SCALE_SHARE, spacing_px / camera.fx)
+
+
+def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float, thickness: float = 1.0) -> None:
+    """Lower `log_scales` in place: to the log of `share` of the distance to the camera, and to flat ones.
+
+    A Gaussian that spans much of the picture, or is long where the camera looks, costs the loss nothing as seen from
+    there, and hangs before the tissue as soon as the camera turns. Called after every step with the camera of its
+    frame: the nearest one decides.
 
     Args:
         log_scales: (N, 3) log of mm. means: (N, 3) centers in world axes, mm. share: above 0.
+        thickness: largest third scale relative to the smaller of the other two, as at the start; 1: any.
     """
     center = torch.as_tensor(camera.center).to(means)
     largest = (share * (means - center).norm(dim=1)).clamp(min=torch.finfo(means.dtype).tiny).log()
     torch.minimum(log_scales, largest[:, None], out=log_scales)
+    if thickness < 1:
+        thin = log_scales[:, :2].amin(1) + math.log(thickness)
+        torch.minimum(log_scales[:, 2], thin, out=log_scales[:, 2])
