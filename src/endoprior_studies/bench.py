@@ -27,13 +27,13 @@ class Bench(Command):
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
     spec: str = field(metadata={"place": "SPEC"})
-    """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: the network that finds tools, on
-    frames that it has not seen (`endoprior bench masks --help`). found_masks: given and found tool masks. poses: given
-    and estimated camera path. reproduce: the paper's tables on EndoNeRF data and SCARED, published figures beside
-    yours; one table: reproduce/NAME with table1, table1_scared, table2, table3, table4, table5. sized: tables for two
-    cores; one: sized/NAME with budgets, compared, depth_flags, growth, instability, ladder, matched, methods,
-    primitives, regime, temporal. full: most of them at full size. whole: each as released and fitted;
-    clip, phantom: full size; small, kinds, parts: small frames. radiance: radiance fields."""
+    """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: the network that finds tools
+    (`endoprior bench masks --help`). found_masks: given and found tool masks. poses: given and estimated camera path.
+    reproduce: the paper's tables on EndoNeRF data and SCARED, published figures beside yours; one table: reproduce/NAME
+    with table1, table1_scared, table2, table3, table4, table5. sized: tables for two cores; one: sized/NAME with
+    budgets, compared, depth_flags, growth, instability, ladder, matched, methods, primitives, regime, temporal. full:
+    most of them at full size. whole: each as released and fitted; clip, phantom: full size; small, kinds, parts: small
+    frames; own: your clip. radiance: radiance fields."""
     out: Path = field(metadata={"place": "OUT"})
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
