@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from .gaussian_trainer import GaussiansState
 
 RESET_OPACITY = 0.01  # where methods that reset opacities lower them to (3DGS)
-MAX_SCALE_SHARE = 0.012
-"""Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned."""
+MAX_SCALE_SHARE = 0.016
+"""Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned, much
+smaller ones leave holes beside silhouettes."""
 
 
 class Before(NamedTuple):
@@ -277,14 +278,16 @@ def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float
 
     A Gaussian that spans much of the picture, or is long where the camera looks, costs the loss nothing as seen from
     there, and hangs before the tissue as soon as the camera turns. Called after every step with the camera of its
-    frame: the nearest one decides.
+    frame: the nearest one decides. What is nearer than the mean counts as far as the mean: a camera that passes close
+    to tissue must not tear it.
 
     Args:
         log_scales: (N, 3) log of mm. means: (N, 3) centers in world axes, mm. share: above 0.
         thickness: largest third scale relative to the smaller of the other two, as at the start; 1: any.
     """
-    center = torch.as_tensor(camera.center).to(means)
-    largest = (share * (means - center).norm(dim=1)).clamp(min=torch.finfo(means.dtype).tiny).log()
+    distance = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
+    reach = torch.maximum(distance, distance.mean()).clamp(min=torch.finfo(means.dtype).tiny)
+    largest = (share * reach).log()
     torch.minimum(log_scales, largest[:, None], out=log_scales)
     if thickness < 1:
         thin = log_scales[:, :2].amin(1) + math.log(thickness)
