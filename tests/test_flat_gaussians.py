@@ -124,13 +124,13 @@ def test_scales_over_time_stay_within_the_factor() -> None:
 
 def test_scales_are_limited_by_the_distance_to_the_camera() -> None:
     cam = camera(25.0)
-    means = torch.tensor([[0.0, 0.0, 50.0], [10.0, -20.0, 100.0]])
-    log_scales = torch.tensor([[-1.0, 0.0, 5.0], [3.0, -4.0, 0.5]])
+    means = torch.tensor([[0.0, 0.0, 50.0], [10.0, -20.0, 100.0], [0.0, 0.0, 5.0]])
+    log_scales = torch.tensor([[-1.0, 0.0, 5.0], [3.0, -4.0, 0.5], [0.0, 1.0, 2.0]])
     before = log_scales.clone()
     limit_scales(log_scales, means, cam, 0.02)
     distances = np.linalg.norm(means.numpy() - cam.center, axis=1)
-    for n in range(2):
-        largest = math.log(0.02 * max(distances[n], distances.mean()))
+    for n in range(3):
+        largest = math.log(0.02 * max(distances[n], np.median(distances)))
         torch.testing.assert_close(log_scales[n], before[n].clamp(max=largest))
 
 

@@ -278,15 +278,15 @@ def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float
 
     A Gaussian that spans much of the picture, or is long where the camera looks, costs the loss nothing as seen from
     there, and hangs before the tissue as soon as the camera turns. Called after every step with the camera of its
-    frame: the nearest one decides. What is nearer than the mean counts as far as the mean: a camera that passes close
-    to tissue must not tear it.
+    frame: the nearest one decides. What is nearer than the median counts as far as it: a camera that passes close to
+    tissue must not tear it.
 
     Args:
         log_scales: (N, 3) log of mm. means: (N, 3) centers in world axes, mm. share: above 0.
         thickness: largest third scale relative to the smaller of the other two, as at the start; 1: any.
     """
     distance = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
-    reach = torch.maximum(distance, distance.mean()).clamp(min=torch.finfo(means.dtype).tiny)
+    reach = torch.maximum(distance, distance.median()).clamp(min=torch.finfo(means.dtype).tiny)
     largest = (share * reach).log()
     torch.minimum(log_scales, largest[:, None], out=log_scales)
     if thickness < 1:
