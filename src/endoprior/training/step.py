@@ -265,9 +265,12 @@ def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
 
 
 def largest_share(camera: Camera, num_first: int) -> float:
-    """Largest canonical scale as a share of the distance to `camera`.
+    """Largest canonical scale as a share of the distance to `camera`: max(`MAX_SCALE_SHARE`, sqrt(W H / N) / fx).
 
-    `MAX_SCALE_SHARE`, but as large as `num_first` Gaussians are apart that fill its image: fewer must be larger.
+    The second is the spacing of N Gaussians that fill the image of W x H px; smaller ones would leave holes.
+
+    Args:
+        num_first: N, the number of first Gaussians, above 0.
     """
     spacing_px = math.sqrt(camera.width * camera.height / num_first)
     return max(MAX_SCALE_SHARE, spacing_px / camera.fx)
