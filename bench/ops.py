@@ -71,7 +71,7 @@ def hexplane(num: int, ops: TrainingOps) -> common.Steps:
 def basis(num: int, ops: TrainingOps) -> common.Steps:
     """Offsets from temporal coefficients, their gradient and their Adam step."""
     cfg = preset("default").fitted(68)
-    motion = torch.zeros(num, *motion_shape(cfg.deformation), requires_grad=True)
+    motion = torch.zeros(num, *motion_shape(cfg), requires_grad=True)
     state, rates = AdamState(motion, cfg.deformation.basis.num_bases), motion_rates(cfg, 1)
     sink: list[RankOneGradient] = []
 
@@ -84,7 +84,7 @@ def basis(num: int, ops: TrainingOps) -> common.Steps:
         sink.clear()
 
     return {
-        "forward": lambda _: basis_offsets(motion, TIME, cfg.deformation, ops.model, sink),
+        "forward": lambda _: basis_offsets(motion, TIME, cfg, ops.model, sink),
         "backward": backward,
         "update": update,
     }

@@ -152,7 +152,7 @@ def torch_rendering(scene: SingleScene) -> common.Steps:
         if isinstance(field, HexPlaneField):
             offsets = field.offsets(gaussians["means"], TIME, TORCH)
         else:
-            offsets = basis_offsets(gaussians["motion"], TIME, cfg.deformation, TORCH)
+            offsets = basis_offsets(gaussians["motion"], TIME, cfg, TORCH)
         splats = gaussians.splats(offsets, cfg.schedule.sh_degree)
         return plain.rasterize(splats, scene.cameras[0], background=torch.zeros(3))
 

@@ -59,7 +59,7 @@ def gaussians(drawn: Splats, cfg: Config) -> Gaussians:
     if cfg.render.color_slopes:
         tensors["color_slopes"] = drawn.color_slopes
     if cfg.deformation.kind == "basis":
-        tensors["motion"] = torch.zeros(len(drawn), *motion_shape(cfg.deformation))
+        tensors["motion"] = torch.zeros(len(drawn), *motion_shape(cfg))
     return Gaussians({name: value.clone() for name, value in tensors.items()})
 
 

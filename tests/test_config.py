@@ -100,7 +100,7 @@ def test_basis_functions_follow_the_length_of_the_sequence():
     fitted = preset("default").fitted(48)
     assert fitted.deformation.basis.num_bases == 27 and fitted.fitted(99) == fitted
     with pytest.raises(ValueError, match="num_bases: expected at least 2"):
-        motion_shape(preset("default").deformation)
+        motion_shape(preset("default"))
 
 
 @pytest.mark.parametrize("name", ["endogaussian", "paper", "released", "endogs", "endo4dgs"])
@@ -132,6 +132,18 @@ def test_short_names_are_those_of_the_command_line():
     assert preset("default", iterations=7, gaussians=15_000) == cfg
     assert Train.from_words(["--iterations", "7", "--gaussians", "15000", "d", "o"]).config == cfg
     assert all(f"--{name}".replace("_", "-") in Train.short for name in config_io.SHORT_NAMES)
+
+
+@pytest.mark.parametrize(
+    ("words", "factor"), [(["--eyes", "both"], 2), (["--data.eyes=both"], 2), (["--eyes", "left"], 1)]
+)
+def test_both_eyes_train_twice_as_long_unless_told_how_long(words, factor):
+    whole = preset("default").schedule.total
+    found = Train.from_words([*words, "d", "o"]).config
+    assert found.schedule.total == factor * whole and found.optim.decay_iterations == factor * whole
+    assert Train.from_words([*words, "--iterations", "70", "d", "o"]).config.schedule.total == 70
+    literal = Train.from_words([*words, "--preset", "paper", "d", "o"]).config
+    assert literal.schedule == preset("paper").schedule
 
 
 def test_another_length_keeps_the_shares_of_the_schedule():

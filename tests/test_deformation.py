@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from endoprior.core.checks import InputError
+from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig
 from endoprior.model import motion as motion_module
 from endoprior.model.gaussians import motion_layout, motion_shape
@@ -24,7 +25,7 @@ from endoprior.model.motion import Offsets, basis_offsets, basis_weights
 from endoprior.model.ops import NUMBA
 
 SMALL = DeformationConfig(kind="hexplane", hexplane=planes((6, 5, 4), 8, 12, (1, 2)), max_scale_change=0.0)
-BASIS = DeformationConfig(basis=BasisConfig(num_bases=9), max_scale_change=0.0)
+BASIS = Config(deformation=DeformationConfig(basis=BasisConfig(num_bases=9), max_scale_change=0.0))
 
 
 def points(num: int = 60, seed: int = 0) -> Tensor:
@@ -218,21 +219,23 @@ def test_motion_layout_follows_the_configuration() -> None:
         "log_scales": slice(7, 10),
         "sh_dc": slice(10, 13),
     }
-    rigid = replace(BASIS, deform_shape=False, deform_opacity=True)
+    rigid = BASIS.replace({"deformation.deform_shape": False, "deformation.deform_opacity": True})
     assert motion_layout(rigid) == {"means": slice(0, 3), "opacity_logits": slice(3, 4), "sh_dc": slice(4, 7)}
-    assert motion_shape(replace(rigid, deform_opacity=False)) == (9, 6)
+    assert motion_shape(rigid.replace({"deformation.deform_opacity": False})) == (9, 6)
+    both = rigid.replace({"data.eyes": "both"})
+    assert motion_layout(both) == motion_layout(rigid) | {"gloss": slice(7, 10)}
 
 
 @pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999, 1.0])
 def test_basis_by_its_definition(time: float) -> None:
-    cfg = replace(BASIS, deform_opacity=True)
-    motion = torch.randn(300, 9, 14, generator=torch.Generator().manual_seed(1))
-    weights = reference_basis.weights(time, cfg.basis)
-    np.testing.assert_allclose(basis_weights(time, cfg.basis), weights, rtol=1e-12)
+    cfg = BASIS.replace({"deformation.deform_opacity": True, "data.eyes": "both"})
+    motion = torch.randn(300, 9, 17, generator=torch.Generator().manual_seed(1))
+    weights = reference_basis.weights(time, cfg.deformation.basis)
+    np.testing.assert_allclose(basis_weights(time, cfg.deformation.basis), weights, rtol=1e-12)
     assert 0 in weights  # the cut is being tested
     total = sum(w * motion[:, b].double() for b, w in enumerate(weights)).float()
     got = basis_offsets(motion, time, cfg, NUMBA)
-    parts = [got.means, got.quats, got.log_scales, got.opacity_logits[:, None], got.sh_dc]
+    parts = [got.means, got.quats, got.log_scales, got.opacity_logits[:, None], got.sh_dc, got.gloss]
     torch.testing.assert_close(torch.cat(parts, -1), total, rtol=1e-5, atol=1e-6)  # nine float32 terms
 
 

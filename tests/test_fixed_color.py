@@ -41,7 +41,7 @@ def wall(shift_mm: float = 0.0, shade: float = 0.0) -> Scene:
     colors = np.repeat(rng.uniform(0.3, 0.5, (len(points), 1)), 3, 1)
     scales = np.full(len(points), np.log(0.4 * DEPTH / FOCAL), np.float32)
     gaussians = create_gaussians(points, colors.astype(np.float32), scales, cfg)
-    layout, weight = motion_layout(cfg.deformation), basis_weights(MIDDLE / NUM_FRAMES, cfg.deformation.basis)[4]
+    layout, weight = motion_layout(cfg), basis_weights(MIDDLE / NUM_FRAMES, cfg.deformation.basis)[4]
     with torch.no_grad():
         gaussians["opacity_logits"].fill_(6.0)
         gaussians["motion"][:, 4, layout["means"].start] = shift_mm / weight
@@ -101,7 +101,7 @@ def test_what_the_first_frame_hides_is_not_painted():
     scene = wall()
     pixels, _ = project(scene.gaussians["means"].detach().numpy(), CAMERA)
     strip = torch.from_numpy((pixels[:, 0] > 60) & (pixels[:, 0] < 100))
-    layout, behind = motion_layout(scene.config.deformation), wall().gaussians.tensors
+    layout, behind = motion_layout(scene.config), wall().gaussians.tensors
     tensors = {name: torch.cat([value, behind[name][strip]]) for name, value in scene.gaussians.tensors.items()}
     front = slice(len(scene), None)
     tensors["means"], tensors["motion"] = tensors["means"].detach(), tensors["motion"].detach()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig
 from endoprior.core.geometry import back_project, pixel_centers, quaternion_to_matrix
 from endoprior.core.types import Camera, Frame
@@ -112,9 +113,9 @@ def test_the_first_gaussians_lie_flat_along_a_slanted_plane() -> None:
 
 
 def test_scales_over_time_stay_within_the_factor() -> None:
-    cfg = DeformationConfig(kind="basis", basis=BasisConfig(num_bases=5), max_scale_change=1.5)
+    cfg = Config(deformation=DeformationConfig(kind="basis", basis=BasisConfig(num_bases=5), max_scale_change=1.5))
     motion = torch.randn(20, 5, 13, generator=torch.Generator().manual_seed(0)) * 3
-    free = torch.einsum("nbc,b->nc", motion, torch.from_numpy(basis_weights(0.3, cfg.basis)).float())
+    free = torch.einsum("nbc,b->nc", motion, torch.from_numpy(basis_weights(0.3, cfg.deformation.basis)).float())
     offsets = basis_offsets(motion, 0.3, cfg, NUMBA)
     limit = math.log(1.5)
     torch.testing.assert_close(offsets.log_scales, free[:, 7:10].clamp(-limit, limit), atol=1e-5, rtol=0)

@@ -15,7 +15,8 @@ from endoprior import preset, train
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
 from endoprior.footage.stereo_order import right_camera, share_of_right
-from endoprior.model.gaussians import Gaussians
+from endoprior.model.colors import with_fixed_color
+from endoprior.model.gaussians import Gaussians, motion_layout
 from endoprior.model.highlights import without_highlights
 from endoprior.model.playback import Playback
 from endoprior.model.scene_file import load_scene
@@ -56,7 +57,9 @@ def test_each_eye_sees_its_own_color(scene):
     plain = replace(scene, baseline_mm=0.0)
     assert torch.equal(first, plain.render(time, left).color) and torch.equal(first, scene.render(time).color)
     assert second.mean() > plain.render(time, right_camera(left, BASELINE)).color.mean() + 0.02
-    gloss = scene.gaussians["gloss"]
+    change = scene.offsets(scene.gaussians, time).gloss[:, None].detach()
+    assert change.abs().max() > 0.01  # it changes with time
+    gloss = scene.gaussians["gloss"] + torch.cat([change, torch.zeros(len(change), 2, 3)], 1)
     between, seen_left = scene.at(time, right_camera(left, BASELINE / 4)), scene.at(time)
     assert torch.allclose(between.sh, seen_left.sh + 0.25 * gloss[:, :1], atol=1e-6) and gloss.abs().max() > 0.05
     assert torch.allclose(between.color_slopes, seen_left.color_slopes + 0.25 * gloss[:, 1:], atol=1e-6)
@@ -75,6 +78,12 @@ def test_without_highlights_both_eyes_see_the_same_tissue(scene, folder):
     assert torch.equal(tissue.at(time, right).sh, tissue.at(time).sh)
 
 
+def test_fixed_colors_of_the_right_eye_are_fixed_too(scene):
+    still = with_fixed_color(scene, [0.2, 0.7])
+    first, second = (still.at(time, right_camera(still.cameras[FRAME], BASELINE)).sh for time in (0.2, 0.7))
+    assert torch.equal(first, second) and not torch.equal(still.at(0.2).sh, first)
+
+
 def test_gloss_is_saved_and_resumed(folder, tmp_path):
     cfg = tiny_config("basis")
     both = replace(cfg, data=replace(cfg.data, eyes="both"))
@@ -84,6 +93,7 @@ def test_gloss_is_saved_and_resumed(folder, tmp_path):
 
 def test_a_scene_from_before_there_was_gloss_has_one_color(scene, tmp_path):
     tensors = {name: value for name, value in scene.gaussians.tensors.items() if name != "gloss"}
+    tensors["motion"] = tensors["motion"][..., : motion_layout(scene.config)["gloss"].start]
     replace(scene, gaussians=Gaussians(tensors), baseline_mm=0.0).save(tmp_path / "scene.safetensors")
     found = load_scene(tmp_path)
     time, right = FRAME / len(scene.cameras), right_camera(scene.cameras[FRAME], BASELINE)

@@ -34,7 +34,7 @@ def wall(shine: Callable[[np.ndarray], np.ndarray]) -> Scene:
     gaussians = create_gaussians(points, np.tile(TISSUE, (len(points), 1)), np.full(len(points), -0.5), cfg)
     with torch.no_grad():
         gaussians["opacity_logits"].fill_(6.0)
-        part = motion_layout(cfg.deformation)["sh_dc"]
+        part = motion_layout(cfg)["sh_dc"]
         white = torch.from_numpy((1.05 - TISSUE) / SH_C0)
         gaussians["motion"][:, :, part] = torch.from_numpy(shine(pixels)).float()[..., None] * white
     num = len(points)
@@ -84,7 +84,7 @@ def test_all_else_stays_as_it_is():
     found = without_highlights(lit, lambda window: frames_of(lit))
     for name in ("means", "quats", "log_scales", "opacity_logits", "color_slopes"):
         assert torch.equal(found.gaussians[name], lit.gaussians[name])
-    part = motion_layout(lit.config.deformation)["sh_dc"]
+    part = motion_layout(lit.config)["sh_dc"]
     assert torch.equal(found.gaussians["motion"][:, :, : part.start], lit.gaussians["motion"][:, :, : part.start])
     dull = wall(lambda pixels: 0.1 * moving(pixels))
     same = without_highlights(dull, lambda window: frames_of(dull))

@@ -58,7 +58,7 @@ def moved_world(scene, world):
     tensors["means"] = tensors["means"] @ turn.T + torch.from_numpy(world[:3, 3]).float()
     quats = Rotation.from_matrix(world[:3, :3]) * Rotation.from_quat(tensors["quats"].numpy(), scalar_first=True)
     tensors["quats"] = torch.from_numpy(quats.as_quat(scalar_first=True)).float()
-    layout = motion_layout(scene.config.deformation)
+    layout = motion_layout(scene.config)
     tensors["motion"][..., layout["means"]] = tensors["motion"][..., layout["means"]] @ turn.T
     back = np.linalg.inv(world)
     cameras = tuple(replace(camera, world_to_camera=camera.world_to_camera @ back) for camera in scene.cameras)
@@ -82,7 +82,7 @@ def scene(phantom):
     trainer = GaussianTrainer(posed(phantom, path()), cfg)
     trainer.start()
     scene = trainer.scene()
-    layout = motion_layout(cfg.deformation)
+    layout = motion_layout(cfg)
     with torch.no_grad():
         scene.gaussians["motion"][..., layout["means"]] = torch.tensor([0.4, -0.2, 0.3])
     return scene

@@ -83,7 +83,7 @@ def test_log_linear_ends_and_middle():
 
 def test_motion_rates_follow_the_layout():
     cfg = preset("default")
-    layout = motion_layout(cfg.deformation)
+    layout = motion_layout(cfg)
     rates = motion_rates(cfg, 0)
     assert set(layout) == {"means", "quats", "log_scales", "sh_dc"} and len(rates) == 13
     assert rates == pytest.approx(cfg.optim.basis_lr)

@@ -82,11 +82,14 @@ class Train(Command):
         first.add_argument("--preset", choices=preset_names())
         first.add_argument("--config", type=Path)
         first.add_argument("--iterations", type=int)
+        first.add_argument("--eyes", "--data.eyes")
         typed, _ = first.parse_known_args(argv)
         name, file = typed.preset or "default", typed.config
         cfg = preset(name) if file is None else read_config(file, preset(name))
         if typed.iterations is not None:
             cfg = cfg.replace({"iterations": typed.iterations})
+        elif typed.eyes == "both" != cfg.data.eyes and not cfg.schedule.literal:
+            cfg = cfg.replace({"iterations": "x2"})  # as many of each eye as of one alone
         args = parse(cls, argv, "train", preset=name, config=cfg, iterations=cfg.schedule.total)
         if typed.iterations is not None and cfg.schedule.literal and not args.resume:
             say(

@@ -55,7 +55,7 @@ class DataConfig(Checked):
     less. `ignored`: all count alike, as published."""
     eyes: Literal["left", "both"] = "left"
     """Eyes whose pictures are trained on, in turn at random; `both` needs the right ones (docs/scores.md). Each sees
-    its own highlights, and has half of the iterations."""
+    its own highlights, and has half of the iterations: `endoprior train` takes twice as many unless told how many."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -28,7 +28,7 @@ from .single_scene import SingleScene
 
 def changes_color(scene: Scene) -> bool:
     """Whether the colors of its Gaussians can change with time."""
-    return "sh_dc" in motion_layout(scene.config.deformation)
+    return "sh_dc" in motion_layout(scene.config)
 
 
 def with_fixed_color(scene: Scene, times: Sequence[float]) -> Scene:
@@ -48,13 +48,15 @@ def with_fixed_color(scene: Scene, times: Sequence[float]) -> Scene:
 
 
 def _fixed(scene: SingleScene, times: NDArray[np.float64]) -> SingleScene:
-    cfg, tensors = scene.config.deformation, dict(scene.gaussians.tensors)
-    weights = np.mean([basis_weights(time, cfg.basis) for time in times], axis=0)
+    tensors, layout = dict(scene.gaussians.tensors), motion_layout(scene.config)
+    weights = np.mean([basis_weights(time, scene.config.deformation.basis) for time in times], axis=0)
     motion = tensors["motion"].detach().clone()
-    colors = motion[:, :, motion_layout(cfg)["sh_dc"]]  # a view: what is set to zero below is part of `motion`
-    mean = torch.einsum("b,nbc->nc", torch.as_tensor(weights).to(colors), colors)
-    tensors["sh_dc"] = tensors["sh_dc"].detach() + mean[:, None]
-    colors.zero_()
+    for name in layout.keys() & {"sh_dc", "gloss"}:
+        colors = motion[:, :, layout[name]]  # a view: what is set to zero below is part of `motion`
+        mean = torch.einsum("b,nbc->nc", torch.as_tensor(weights).to(colors), colors)
+        tensors[name] = tensors[name].detach().clone()
+        tensors[name][:, 0] += mean
+        colors.zero_()
     return replace(scene, gaussians=Gaussians(tensors | {"motion": motion}))
 
 

@@ -57,24 +57,31 @@ def offset_widths(cfg: DeformationConfig) -> dict[str, int]:
     return {a.name: a.width for a in ATTRIBUTES if a.changes(cfg)}
 
 
-def motion_layout(cfg: DeformationConfig) -> dict[str, slice]:
+def motion_widths(cfg: Config) -> dict[str, int]:
+    """`offset_widths`, and what the right eye sees more if both are trained on: only coefficients change that."""
+    widths = offset_widths(cfg.deformation)
+    return widths | {"gloss": 3} if cfg.data.eyes == "both" else widths
+
+
+def motion_layout(cfg: Config) -> dict[str, slice]:
     """Channels of `motion` by the attribute that they change."""
     layout, start = {}, 0
-    for name, width in offset_widths(cfg).items():
+    for name, width in motion_widths(cfg).items():
         layout[name] = slice(start, start + width)
         start += width
     return layout
 
 
-def motion_shape(cfg: DeformationConfig) -> tuple[int, int]:
+def motion_shape(cfg: Config) -> tuple[int, int]:
     """Basis functions and channels of `motion`.
 
     Raises:
         InputError: the config leaves the number of temporal basis functions open.
     """
-    if cfg.basis.num_bases == 0:
+    num_bases = cfg.deformation.basis.num_bases
+    if num_bases == 0:
         raise InputError("config.deformation.basis.num_bases: expected at least 2; got 0.")
-    return cfg.basis.num_bases, sum(offset_widths(cfg).values())
+    return num_bases, sum(motion_widths(cfg).values())
 
 
 def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:
@@ -143,7 +150,10 @@ class Gaussians:
             sh_dc = sh_dc + offsets.sh_dc[:, None, :]
         color_slopes = t.get("color_slopes")
         if right_share and "gloss" in t:
-            gloss = right_share * t["gloss"]
+            gloss = t["gloss"]
+            if offsets is not None and offsets.gloss is not None:
+                gloss = torch.cat([gloss[:, :1] + offsets.gloss[:, None, :], gloss[:, 1:]], 1)
+            gloss = right_share * gloss
             sh_dc = sh_dc + gloss[:, :1]
             color_slopes = color_slopes if color_slopes is None else color_slopes + gloss[:, 1:]
         sh_rest = _moved(t["sh_rest"], offsets and offsets.sh_rest)

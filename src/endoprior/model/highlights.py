@@ -68,10 +68,10 @@ def without_highlights(scene: Scene, frames_of: FramesOf) -> Scene:
 def _refitted_scene(scene: SingleScene, frames: Iterable[Frame]) -> SingleScene:
     """Args: frames: those it was trained on."""
     free, times = _free_of_highlights(scene, frames)
-    cfg, tensors = scene.config.deformation, dict(scene.gaussians.tensors)
+    cfg, tensors = scene.config, dict(scene.gaussians.tensors)
     part = motion_layout(cfg)["sh_dc"]
     motion, sh_dc = tensors["motion"].detach().clone(), tensors["sh_dc"].detach().clone()
-    basis = torch.as_tensor(np.stack([basis_weights(t, cfg.basis) for t in times])).to(motion)
+    basis = torch.as_tensor(np.stack([basis_weights(t, cfg.deformation.basis) for t in times])).to(motion)
     weights = torch.as_tensor(np.where(np.isnan(free), UNSEEN, free)).to(motion)
     touched = np.nanmin(free, axis=1, initial=1) < 1 - UNTOUCHED
     chunk = max(LARGEST_CHUNK // (max(basis.shape) * basis.shape[1]), 1)
@@ -88,8 +88,11 @@ def _refitted_scene(scene: SingleScene, frames: Iterable[Frame]) -> SingleScene:
         taken = new - old.detach()
         _take_from_neighbors(means, ~never_seen, never_seen, taken)
         new[unseen] += taken[unseen]
-    tensors.pop("gloss", None)  # the right eye sees the same tissue
-    return replace(scene, gaussians=Gaussians(tensors | {"sh_dc": sh_dc, "motion": motion}), baseline_mm=0.0)
+    if tensors.pop("gloss", None) is not None:  # the right eye sees the same tissue
+        motion = motion[:, :, : motion_layout(cfg)["gloss"].start]
+        cfg = replace(cfg, data=replace(cfg.data, eyes="left"))
+    gaussians = Gaussians(tensors | {"sh_dc": sh_dc, "motion": motion})
+    return replace(scene, gaussians=gaussians, config=cfg, baseline_mm=0.0)
 
 
 def _free_of_highlights(scene: SingleScene, frames: Iterable[Frame]) -> tuple[NDArray[np.float32], list[float]]:

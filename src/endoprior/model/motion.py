@@ -29,7 +29,7 @@ from ..core.checks import check_shape
 from ..core.config import Config
 from ..core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
 from ..system.arrays_file import ArraySpec
-from .gaussians import attribute_shapes, motion_shape, offset_widths
+from .gaussians import attribute_shapes, motion_shape, motion_widths
 
 if TYPE_CHECKING:
     from .gaussians import Gaussians
@@ -58,10 +58,12 @@ class Offsets:
     """(N, 3), added to the spherical-harmonic coefficient of degree 0."""
     sh_rest: Tensor | None = None
     """(N, (D+1)**2 - 1, 3), added to those of the other degrees."""
+    gloss: Tensor | None = None
+    """(N, 3), added to what the right eye sees more of the color, a coefficient of degree 0."""
 
     @staticmethod
     def from_channels(channels: dict[str, Tensor], cfg: DeformationConfig) -> Offsets:
-        """Offsets from tensors (N, width) by name, as `offset_widths` names them; scales within bounds."""
+        """Offsets from tensors (N, width) by name, as `motion_widths` names them; scales within bounds."""
         if "opacity_logits" in channels:
             channels["opacity_logits"] = channels["opacity_logits"][:, 0]
         if "log_scales" in channels and cfg.max_scale_change > 1:
@@ -176,7 +178,7 @@ class BasisMotion(Motion):
 
     def tensors(self, cfg: Config) -> dict[str, tuple[int, ...]]:
         """See `Motion.tensors`."""
-        return {"motion": motion_shape(cfg.deformation)}
+        return {"motion": motion_shape(cfg)}
 
     @override
     def offsets(
@@ -191,7 +193,7 @@ class BasisMotion(Motion):
         """See `Motion.offsets`. Unless some are chosen, the gradient goes to `gaussians.motion_gradients`."""
         rows = slice(None) if chosen is None else chosen
         sink = gaussians.motion_gradients if chosen is None else None
-        return basis_offsets(gaussians["motion"][rows], time, cfg.deformation, ops, sink)
+        return basis_offsets(gaussians["motion"][rows], time, cfg, ops, sink)
 
 
 def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
@@ -205,7 +207,7 @@ def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
 def basis_offsets(
     motion: Tensor,
     time: float,
-    cfg: DeformationConfig,
+    cfg: Config,
     ops: ModelOps,
     sink: list[RankOneGradient | UnstoredGradient] | None = None,
 ) -> Offsets:
@@ -221,9 +223,10 @@ def basis_offsets(
     """
     num_bases, channels = motion_shape(cfg)
     check_shape(f"motion:N,{num_bases},{channels}", motion=motion)
-    total = _WeightedSum.apply(motion, basis_weights(time, cfg.basis), sink, ops)
-    widths = offset_widths(cfg)  # `split` has one gradient; slices have one each, of full size, to add up
-    return Offsets.from_channels(dict(zip(widths, total.split(list(widths.values()), 1), strict=True)), cfg)
+    total = _WeightedSum.apply(motion, basis_weights(time, cfg.deformation.basis), sink, ops)
+    widths = motion_widths(cfg)  # `split` has one gradient; slices have one each, of full size, to add up
+    parts = dict(zip(widths, total.split(list(widths.values()), 1), strict=True))
+    return Offsets.from_channels(parts, cfg.deformation)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from ..core.checks import input_error
+from ..core.config import Config
 from ..core.config_io import from_dict
 from ..core.geometry import FARTHEST_MM
 from ..core.shell import command
@@ -50,7 +52,7 @@ def load_scene(path: str | Path) -> RenderedScene:
     arrays, about = load_arrays(file, {FORMAT: scene_schema, windowed_scene.FORMAT: index_schema}, NEXT_STEP)
     with rejecting(file, "a scene", NEXT_STEP):
         known = {name: value for name, value in about.items() if name != "format"}
-        facts = from_dict(SceneFacts, known | {"config": config_from(about["config"])}, "about")
+        facts = from_dict(SceneFacts, known | {"config": _config(about)}, "about")
         _check_cameras(arrays)
         if about["format"] == windowed_scene.FORMAT:
             return _windowed(arrays, facts, file)
@@ -59,12 +61,16 @@ def load_scene(path: str | Path) -> RenderedScene:
 
 def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a scene's file of this description; `T` frames."""
-    cfg = config_from(about["config"])
+    cfg = _config(about)
     smoke = {"smoke": ArraySpec("float32", ("T", *GRID, 2))} if about.get("smoke") else {}
-    shapes = method_of(cfg).schema(cfg) | CAMERAS | smoke
-    if not about.get("baseline_mm"):  # a scene of both eyes from before there was gloss
-        shapes.pop("gaussians.gloss", None)
-    return shapes
+    return method_of(cfg).schema(cfg) | CAMERAS | smoke
+
+
+def _config(about: dict[str, Any]) -> Config:
+    """What a scene was trained with; one of both eyes from before there was gloss is as one of the left eye."""
+    cfg = config_from(about["config"])
+    of_one = about["format"] == FORMAT and not about.get("baseline_mm")
+    return replace(cfg, data=replace(cfg.data, eyes="left")) if of_one else cfg
 
 
 def index_schema(_about: dict[str, Any]) -> dict[str, ArraySpec]:

@@ -163,7 +163,7 @@ class GaussianTrainer(Trainer):
         gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
         if motion is not None:
             coefficients = torch.from_numpy(motion.coefficients)
-            gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
+            gaussians["motion"].detach()[..., motion_layout(cfg)["means"]] = coefficients
             if cfg.loss.track_weight:
                 followed = torch.from_numpy(motion.followed).float()
                 tracks = StartTracks(coefficients, followed, torch.arange(len(coefficients))).to(self.device)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.config import Config, OptimConfig
-from ..model.gaussians import ATTRIBUTES, Gaussians, offset_widths
+from ..model.gaussians import ATTRIBUTES, Gaussians, motion_widths
 from ..model.motion import Field, UnstoredGradient
 from ..system.arrays_file import part
 from .adam import AdamState, PlaneAdam, adam_unstored_step
@@ -70,7 +70,7 @@ def motion_rates(cfg: Config, iteration: int) -> NDArray:
     """(C,) learning rate of each channel of the temporal coefficients."""
     decay = log_linear(1.0, BASIS_DECAY, iteration, cfg.optim.decay_iterations)
     own = {"opacity_logits": BASIS_OPACITY_LR}
-    widths = offset_widths(cfg.deformation)
+    widths = motion_widths(cfg)
     return np.concatenate([np.full(width, own.get(name, cfg.optim.basis_lr) * decay) for name, width in widths.items()])
 
 
