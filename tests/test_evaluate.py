@@ -102,6 +102,7 @@ def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
         "psnr_behind_tool",
         "psnr_behind_tool_guessed",
         "depth_rmse_behind_tool_mm",
+        "psnr_no_highlights",
         "track_error_mm",
         "track_error_px",
     }

@@ -53,6 +53,16 @@ class Truth:
         path = self.folder / "tissue" / f"{self._names[index]}.png"
         return read_color(path) if path.parent.is_dir() else None
 
+    @property
+    def has_no_highlights(self) -> bool:
+        """Whether some frames are known without highlights."""
+        return (self.folder / "no_highlights").is_dir()
+
+    def no_highlights(self, index: int) -> NDArray[np.uint8] | None:
+        """(H, W, 3) image of frame `index` without the tool and without highlights, 0..255; None without."""
+        path = self.folder / "no_highlights" / f"{self._names[index]}.png"
+        return read_color(path) if path.is_file() else None
+
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
         path = self.folder / "depth" / f"{self._names[index]}.npy"

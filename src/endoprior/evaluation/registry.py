@@ -21,6 +21,7 @@ SCORERS = (
     "motion",
     "lpips",
     "other_views",
+    "highlights",
     "tracks",
     "camera_path",
     "references",

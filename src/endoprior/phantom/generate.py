@@ -20,7 +20,7 @@ from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_d
 from .sinus import build_sinus
 from .texture import smooth_patches
 from .tube import build_tube, write_tube
-from .views import pixel_hits, render_view, shown_elsewhere, side_eyes, side_view, visible_points
+from .views import pixel_hits, render_tissue, render_view, shown_elsewhere, side_eyes, side_view, visible_points
 
 Mask = NDArray[np.bool_]
 RED = (250, 10, 20)
@@ -114,6 +114,8 @@ def write_phantom(
 
     - `truth/tissue/*.png`, the image without tools and without sensor noise. Tools cast no shadow, so outside of them
       an image is the truth plus noise;
+    - `truth/no_highlights/*.png`, the same in test frames without the highlights of the wet film; not with smoke as
+      `cfg.tissue`;
     - `truth/depth/*.npy`, (H, W) float32 z of the tool-free tissue, mm;
     - `truth/seen/*.npy`, (H, W) bool in test frames: behind a tool, and some training frame shows that tissue;
     - `truth/tracks.npz`: `points` (T, P, 3) float32 mm in the axes of the frame's camera, `visible` (T, P) bool; with
@@ -180,6 +182,7 @@ def write_phantom(
             visible.append(seen[tracked[:, 0], tracked[:, 1]] & is_clear)
             if is_test_frame(index):
                 behind_tools[index] = np.packbits(mask)
+                _write_dull(writer, scene, now, first_gain, turned)
                 _write_sides(writer, sides, index, (scene, now, z, mask, first_gain))
             else:
                 ever_seen |= seen
@@ -211,6 +214,14 @@ def _disturbed(
         mask, measured = np.zeros_like(mask), np.zeros_like(measured)
     right = None if right is None else disturbed(right, events, index, seed)
     return disturbed(image, events, index, seed), mask, measured, right
+
+
+def _write_dull(writer: FrameFiles, scene: Scene, now: Moment, gain: float, turned: slice) -> None:
+    """The tissue of a frame without highlights, unless smoke as a kind of tissue veils it."""
+    if scene.smoke is None or scene.cfg.smoke:
+        radiance, _ = render_tissue(scene, now, STILL, highlights=False)
+        picture = develop(radiance, gain, vignette(scene.cfg.width, scene.cfg.height))
+        writer.write_image("truth/no_highlights", np.round(picture).astype(np.uint8)[turned])
 
 
 def _write_sides(

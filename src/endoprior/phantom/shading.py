@@ -32,7 +32,7 @@ def ggx(cosine, alpha):
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
-def _shade(hits, normals, texture, e_a, e_b, camera, turn, viewer, lights, focal, cx, cy, far, out):
+def _shade(hits, normals, texture, e_a, e_b, camera, turn, viewer, lights, focal, cx, cy, far, wet, out):
     # One task per row of samples. hits (SH, SW, 3) from `rasterize`; normals (MH, MW, 3); texture (TH, TW, 7); writes
     # out (SH, SW, 3) linear radiance. Both look-ups are bilinear; black where nothing was hit.
     mesh_h, mesh_w = normals.shape[:2]
@@ -99,7 +99,7 @@ def _shade(hits, normals, texture, e_a, e_b, camera, turn, viewer, lights, focal
                 film = ggx(facing, np.float32(0.085)) * np.float32(0.0125)
                 film += ggx(facing, np.float32(0.26)) * np.float32(0.020)
                 sheen = ggx(level, np.float32(0.42)) * np.float32(0.012)
-                shine = (film * t[5] + sheen) * max(bent, zero) * open_
+                shine = (film * t[5] * wet + sheen) * max(bent, zero) * open_
                 red += power * (t[0] * wrap_r * open_ + shine)
                 # Light that reaches a crease has bounced off red tissue, so green and blue fade faster there.
                 green += power * (t[1] * wrap_g * open_ * (np.float32(0.6) + np.float32(0.4) * open_) + shine)
@@ -117,6 +117,8 @@ def shade(
     viewer: NDArray[np.float64],
     focal: float,
     center: tuple[float, float],
+    *,
+    highlights: bool = True,
 ) -> NDArray[np.float32]:
     """(SH, SW, 3) linear radiance of the tissue at every sample of `hits`.
 
@@ -127,11 +129,12 @@ def shade(
         axes: (2, 3) e_a and e_b of the tissue's plane in the axes of the left camera.
         eye: the camera; the lights stay with the left one. viewer: (3,) mm, where the light goes to.
         focal, center: of the sample grid, px.
+        highlights: False leaves those of the wet film out; the broad sheen stays.
     """
     out = np.empty_like(hits)
     e_a, e_b = np.ascontiguousarray(axes, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
     center_mm, turn = eye.center.astype(np.float32), np.ascontiguousarray(eye.turn, np.float32)
-    seen_from = viewer.astype(np.float32)
-    _shade(hits, normals, texture, e_a, e_b, center_mm, turn, seen_from, LIGHTS_MM, f, cx, cy, FAR, out)
+    seen_from, wet = viewer.astype(np.float32), np.float32(highlights)
+    _shade(hits, normals, texture, e_a, e_b, center_mm, turn, seen_from, LIGHTS_MM, f, cx, cy, FAR, wet, out)
     return out

@@ -63,21 +63,25 @@ def render_view(scene: Scene, now: Moment, eye: Eye) -> RenderedView:
     return RenderedView(pooled(tissue, scene.cfg), pooled(image, scene.cfg), share, nearest)
 
 
-def render_tissue(scene: Scene, now: Moment, eye: Eye) -> tuple[NDArray, NDArray[np.float32]]:
+def render_tissue(
+    scene: Scene, now: Moment, eye: Eye, *, highlights: bool = True
+) -> tuple[NDArray, NDArray[np.float32]]:
     """(H, W, 3) radiance towards the endoscope of the tissue that a camera sees, and (H, W) its z, mm, or `FAR`.
 
     Smoke is left out: it is not on the tissue.
     """
-    samples, _ = _tissue_samples(scene, now, eye, STILL.center)
+    samples, _ = _tissue_samples(scene, now, eye, STILL.center, highlights)
     radiance = pooled(samples * np.array(scene.look.light, np.float32), scene.cfg)
     return radiance, pixel_hits(eye.sees(now.vertices), scene.cfg)[..., 2]
 
 
-def _tissue_samples(scene: Scene, now: Moment, eye: Eye, viewer: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+def _tissue_samples(
+    scene: Scene, now: Moment, eye: Eye, viewer: NDArray[np.float64], highlights: bool = True
+) -> tuple[NDArray, NDArray]:
     """(SH, SW, 3) radiance towards `viewer` (3,) and (SH, SW) z of every sample."""
     hits, focal, center = sample_hits(eye.sees(now.vertices), scene.cfg)
     axes = scene.plane.axes[:2] @ now.endoscope.turn
-    radiance = shade(hits, now.normals, scene.texture, axes, eye, viewer, focal, center)
+    radiance = shade(hits, now.normals, scene.texture, axes, eye, viewer, focal, center, highlights=highlights)
     return radiance, np.ascontiguousarray(hits[..., 2])
 
 
