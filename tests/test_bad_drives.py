@@ -138,8 +138,12 @@ def test_a_signal_leaves_no_probe_of_a_folder(tmp_path, monkeypatch, name):
         signal.raise_signal(getattr(signal, name))
 
     monkeypatch.setattr(Path, "touch", stop)
-    with all_interrupt(), pytest.raises(KeyboardInterrupt):
-        require_writable_folder("OUT", tmp_path / "out")
+    before = signal.signal(getattr(signal, name), signal.SIG_DFL)  # `nohup` ignores SIGHUP, and the program with it
+    try:
+        with all_interrupt(), pytest.raises(KeyboardInterrupt):
+            require_writable_folder("OUT", tmp_path / "out")
+    finally:
+        signal.signal(getattr(signal, name), before)
     assert list(tmp_path.iterdir()) == []
 
 
