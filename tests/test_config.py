@@ -19,6 +19,7 @@ from endoprior.model.method import config_from, method_of
 from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.folder import reject_other_run
+from endoprior.training.gaussian_trainer import spatial_scale
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
 PRESETS = ("default", "best", "paper", "released", "endogaussian")
@@ -112,6 +113,12 @@ def test_planes_fitted_to_the_clip_have_half_a_cell_a_frame_in_the_half_that_tim
         assert method_of(cfg).fitted(fitted, frames) == fitted, "so that a run resumes"
     as_released = preset(name)
     assert method_of(cfg).fitted(as_released, 24).deformation.hexplane == as_released.deformation.hexplane
+
+
+@pytest.mark.parametrize(("extent", "released", "fitted"), [(0.0, 10, 10), (6.0, 6, 6), (60.0, 60, 10)])
+def test_rates_that_are_lengths_are_fitted_to_a_camera_that_goes_far(extent, released, fitted):
+    assert spatial_scale(extent, fit_to_clip=False) == released
+    assert spatial_scale(extent, fit_to_clip=True) == fitted
 
 
 def test_a_run_fitted_to_the_clip_cannot_be_extended():

@@ -253,7 +253,7 @@ class Config(Checked):
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random choices. Sampling, initial weights, frame order and splits."""
     fit_to_clip: bool = False
-    """Fit a published method to the length of the clip and of the training (docs/methods.md); `default` always is."""
+    """Fit a published method to the clip: its length, its camera's path, the training's length (docs/methods.md)."""
     data: DataConfig = field(default_factory=DataConfig)
     init: InitConfig = field(default_factory=InitConfig)
     deformation: DeformationConfig = field(default_factory=DeformationConfig)

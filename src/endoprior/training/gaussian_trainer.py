@@ -44,7 +44,17 @@ from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, devi
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
 
-STILL_CAMERA_SCALE = 10.0  # spatial scale of a sequence with a static camera
+STILL_CAMERA_SCALE = 10.0  # spatial scale of a sequence with a static camera, mm
+
+
+def spatial_scale(extent: float, fit_to_clip: bool) -> float:
+    """What multiplies learning rates that are lengths, mm: the `scene_extent`, or 10 where the camera is still.
+
+    `fit_to_clip` takes no more than 10: what a long camera path multiplies throws the tissue out of view.
+    """
+    if extent <= 1e-3:
+        return STILL_CAMERA_SCALE
+    return min(extent, STILL_CAMERA_SCALE) if fit_to_clip else extent
 
 
 @dataclass
@@ -124,7 +134,7 @@ class GaussianTrainer(Trainer):
         frames = TrainingFrames(sequence, "zero" if cfg.released.prior else "reflect", self.device)
         centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
         extent = scene_extent(centers)
-        self.spatial_scale = extent if extent > 1e-3 else STILL_CAMERA_SCALE  # of learning rates that are lengths
+        self.spatial_scale = spatial_scale(extent, cfg.fit_to_clip)
         self.step_once = TrainingStep(
             method=self.method,
             motion=self.motion,
