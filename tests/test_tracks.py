@@ -225,17 +225,6 @@ def test_points_without_neighbors_stay():
     assert np.isnan(filled[:, 2]).all()
 
 
-def test_fit_reproduces_offsets_in_the_span_of_the_basis():
-    cfg, rng = BasisConfig(num_bases=5), np.random.default_rng(1)
-    times = [i / 40 for i in range(40)]
-    coefficients = rng.normal(size=(4, 5, 3))
-    weights = np.stack([basis_weights(t, cfg) for t in times])
-    offsets = np.einsum("tb,nbc->tnc", weights, coefficients)
-    fitted = tracks.fit_basis(offsets, times, cfg)
-    assert fitted.shape == (4, 5, 3)
-    np.testing.assert_allclose(np.einsum("tb,nbc->tnc", weights, fitted), offsets, atol=0.05)  # the ridge pulls to 0
-
-
 def test_unmeasured_depth_leaves_a_gap():
     frames = moving_frames((0.0, 0.0))
     frames[2].depth_valid[:] = False

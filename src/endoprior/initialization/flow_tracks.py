@@ -31,8 +31,8 @@ from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
 from ..footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow, stuck
-from ..model.motion import basis_weights
 from ..system.memory import workers
+from .motion_fit import fit_motion
 from .neighbor_motion import fill_gaps, smooth_motion
 from .sampling import PointCloud, has_surface
 
@@ -44,7 +44,6 @@ CYCLE_PX, CYCLE_SHARE = (0.25, 0.6), 0.5
 which keeps this share of all points and frames, within these bounds. Poor images close worse, and the few of their
 points that close well are too few to carry the rest."""
 ANCHOR_BYTES = 8 * (2 * REACH + 1)  # memory per pixel of the flows of one anchor, bytes
-RIDGE = 1e-5  # ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1
 Flow = NDArray[np.float16]
 """(h, w, 2) px of the gray images. Half precision: 0.01 px at 30 px, and all flows of an anchor fit in memory."""
 
@@ -82,7 +81,9 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
     log.info("initial motion: points are followed in %.0f %% of the frames", 100 * followed.mean())
     positions[cloud.origins, np.arange(len(cloud))] = cloud.points
     offsets = smooth_motion(fill_gaps(positions), cloud.origins)
-    return InitialMotion(fit_basis(offsets, [frame.time for frame in frames], cfg), followed)
+    rays = cloud.points - np.stack([frame.camera.center for frame in frames])[cloud.origins]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return InitialMotion(fit_motion(offsets, rays, [frame.time for frame in frames], cfg), followed)
 
 
 def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float32]:
@@ -210,14 +211,6 @@ def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float32]:
         depth = frame.depth[y, x].astype(np.float64)[measured]
         found[position, known[measured]] = back_project(pixels[position, known[measured]], depth, frame.camera)
     return found
-
-
-def fit_basis(offsets: NDArray[np.floating], times: list[float], cfg: BasisConfig) -> NDArray[np.float32]:
-    """Least-squares coefficients (N, B, 3) of offsets (T, N, 3) mm at T `times` in [0, 1]."""
-    weights = np.stack([basis_weights(time, cfg) for time in times])
-    normal = weights.T @ weights + RIDGE * np.eye(cfg.num_bases)
-    fitted = np.linalg.solve(normal, weights.T) @ offsets.reshape(len(times), -1)
-    return np.ascontiguousarray(fitted.reshape(cfg.num_bases, -1, 3).transpose(1, 0, 2), np.float32)
 
 
 @njit(parallel=True, cache=True)
