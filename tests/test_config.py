@@ -105,11 +105,11 @@ def test_basis_functions_follow_the_length_of_the_sequence():
 
 
 @pytest.mark.parametrize("name", ["endogaussian", "paper", "released", "endogs", "endo4dgs"])
-def test_planes_fitted_to_the_clip_have_half_a_cell_a_frame_in_the_half_that_times_use(name):
+def test_planes_fitted_to_the_clip_have_as_many_cells_a_frame_in_the_half_that_times_use(name):
     cfg = preset(name, fit_to_clip=True)
     for frames in (24, 48, 156):
         fitted = method_of(cfg).fitted(cfg, frames)
-        assert (fitted.deformation.hexplane.time_resolution - 1) / 2 / frames == 0.5
+        assert (fitted.deformation.hexplane.time_resolution - 1) / 2 / frames == pytest.approx(0.4, abs=0.25 / frames)
         assert method_of(cfg).fitted(fitted, frames) == fitted, "so that a run resumes"
     as_released = preset(name)
     assert method_of(cfg).fitted(as_released, 24).deformation.hexplane == as_released.deformation.hexplane

@@ -11,8 +11,9 @@ from .ranges import Checked, Range
 FRAMES_PER_BASIS = 1.8
 """Frames of the sequence for each basis function; 1.5 to 3.5 are best, more functions follow held-out frames worse."""
 FEWEST_BASES, MOST_BASES = 4, 1000
-CELLS_PER_FRAME = 0.5
-"""Cells of a HexPlane along time for each frame, where `fit_to_clip` is on: published are 0.79 and 0.32."""
+CELLS_PER_FRAME = 0.4
+"""Cells of a HexPlane along time for each frame, where `fit_to_clip` is on: published are 0.79 and 0.32. With 0.5 every
+second frame can lie on a node of the planes, which only its neighbors pin where it is held out (docs/log.md)."""
 
 
 @dataclass(frozen=True)
