@@ -219,7 +219,7 @@ def test_the_ladder_leads_from_endogaussian_to_released(size):
 FULL = ("full/compared", "whole/clip", "whole/phantom")
 
 
-@pytest.mark.parametrize("name", [*FULL, "sized/compared", "whole/small", "whole/kinds", "whole/own"])
+@pytest.mark.parametrize("name", [*FULL, "sized/compared", "whole/kinds", "whole/own"])
 def test_each_compared_method_is_there_as_released_and_fitted_to_the_clip(name):
     spec = load_spec(find_spec(name))
     fitted = [method for method in spec.methods if method.endswith("_fitted")]
