@@ -73,5 +73,5 @@ class DeformationConfig(Checked):
     deform_opacity: bool = False
     """Let opacity change with time, as the released code does; EndoGaussian renders the canonical one."""
     max_scale_change: Annotated[float, Range(0, 1e6)] = 2.0
-    """Over time a scale becomes at most this many times larger or smaller, and no canonical one exceeds 1.6 % of its
-    distance to the camera. Higher blurs what is seen from aside; up to 1 sets no limit."""
+    """Over time a scale becomes at most this many times larger or smaller, and no canonical one exceeds about 1.6 % of
+    its distance to the camera. Higher blurs what is seen from aside; up to 1 sets no limit."""
