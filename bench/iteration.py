@@ -15,7 +15,7 @@ import torch
 
 from endoprior.core.config import Config
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.model import motion
+from endoprior.model import basis
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
@@ -36,7 +36,7 @@ NEVER = 1_000_000
 TORCH_MOST = common.Size(20_000, 640, 512)
 """With more Gaussians or pixels, autograd's memory takes torch from seconds to minutes."""
 PARTS = {
-    "deformation": [(motion, "basis_offsets"), (HexPlaneField, "offsets"), (HexPlaneField, "offsets_and_displacement")],
+    "deformation": [(basis, "basis_offsets"), (HexPlaneField, "offsets"), (HexPlaneField, "offsets_and_displacement")],
     "projection + SH": [(numba_backend, "project_forward")],
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],

@@ -12,13 +12,14 @@ import torch
 
 from endoprior.compute.relu_network import relu_network, relu_network_torch
 from endoprior.core.config_deformation import DeformationConfig
-from endoprior.model.gaussians import motion_shape
+from endoprior.model.basis import basis_offsets
+from endoprior.model.gaussians import temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField
-from endoprior.model.motion import RankOneGradient, basis_offsets
+from endoprior.model.motion import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
-from endoprior.training.optimizer import Optimizer, motion_rates, rate_of
+from endoprior.training.optimizer import TEMPORAL, Optimizer, rate_of, temporal_rates
 from endoprior.training.temporal import MOST_POINTS
 from endoprior_baselines.surgicalgaussian import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
@@ -71,8 +72,8 @@ def hexplane(num: int, ops: TrainingOps) -> common.Steps:
 def basis(num: int, ops: TrainingOps) -> common.Steps:
     """Offsets from temporal coefficients, their gradient and their Adam step."""
     cfg = preset("default").fitted(68)
-    motion = torch.zeros(num, *motion_shape(cfg), requires_grad=True)
-    state, rates = AdamState(motion, cfg.deformation.basis.num_bases), motion_rates(cfg, 1)
+    tensors = {n: torch.zeros(num, *shape, requires_grad=True) for n, shape in temporal_shapes(cfg).items()}
+    states = {n: AdamState(tensors[n], tensors[n].shape[1]) for n in TEMPORAL}
     sink: list[RankOneGradient] = []
 
     def backward(offsets: object) -> None:
@@ -80,11 +81,13 @@ def basis(num: int, ops: TrainingOps) -> common.Steps:
         torch.autograd.backward(found, [torch.ones_like(value) for value in found])
 
     def update(_: object) -> None:
-        ops.adam_basis_step(state, motion, sink, rates, EPSILON)
+        for name, state in states.items():
+            gradients = [gradient for gradient in sink if gradient.name == name]
+            ops.adam_basis_step(state, tensors[name], gradients, temporal_rates(name, cfg, 1), EPSILON)
         sink.clear()
 
     return {
-        "forward": lambda _: basis_offsets(motion, TIME, cfg, ops.model, sink),
+        "forward": lambda _: basis_offsets(tensors, TIME, cfg, ops.model, sink),
         "backward": backward,
         "update": update,
     }

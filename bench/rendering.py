@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from endoprior.core.types import Camera, RenderOutput, Splats
+from endoprior.model.basis import BasisMotion, basis_offsets
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
-from endoprior.model.motion import BasisMotion, basis_offsets
 from endoprior.model.ops import TORCH
 from endoprior.model.playback import Playback
 from endoprior.model.presets import preset
@@ -152,7 +152,7 @@ def torch_rendering(scene: SingleScene) -> common.Steps:
         if isinstance(field, HexPlaneField):
             offsets = field.offsets(gaussians["means"], TIME, TORCH)
         else:
-            offsets = basis_offsets(gaussians["motion"], TIME, cfg, TORCH)
+            offsets = basis_offsets(gaussians.tensors, TIME, cfg, TORCH)
         splats = gaussians.splats(offsets, cfg.schedule.sh_degree)
         return plain.rasterize(splats, scene.cameras[0], background=torch.zeros(3))
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, Splats
-from endoprior.model.gaussians import Gaussians, motion_shape
+from endoprior.model.gaussians import Gaussians, temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.single_scene import SingleScene
 
@@ -59,7 +59,7 @@ def gaussians(drawn: Splats, cfg: Config) -> Gaussians:
     if cfg.render.color_slopes:
         tensors["color_slopes"] = drawn.color_slopes
     if cfg.deformation.kind == "basis":
-        tensors["motion"] = torch.zeros(len(drawn), *motion_shape(cfg))
+        tensors |= {name: torch.zeros(len(drawn), *shape) for name, shape in temporal_shapes(cfg).items()}
     return Gaussians({name: value.clone() for name, value in tensors.items()})
 
 

@@ -21,15 +21,21 @@ def read(path):
 
 
 def basis_offsets(arrays, about, t):
-    cfg, motion = about["config"]["deformation"], arrays["gaussians.motion"]
-    d = (t - np.linspace(0, 1, motion.shape[1])) / (cfg["basis"].get("relative_width", 1.5) / motion.shape[1])
-    e = np.exp(-4.5)
-    total = np.einsum("b,nbc->nc", np.maximum(0, (np.exp(-(d**2) / 2) - e) / (1 - e)), motion)
-    turns, grows = (cfg.get(name, cfg.get("deform_shape")) for name in ("deform_quats", "deform_scales"))
-    widths = {"means": 3, "quats": 4 * turns, "log_scales": 3 * grows}
-    widths |= {"opacity_logits": 1 * cfg["deform_opacity"], "sh_dc": 3 * cfg["basis"].get("deform_color", True)}
+    def splines(count):
+        x = np.abs(t * (count - 3) - np.arange(count) + 1)
+        return np.where(x < 1, 2 / 3 - x**2 + x**3 / 2, np.maximum(2 - x, 0) ** 3 / 6)
+
+    motion, changes, shifts = (arrays[f"gaussians.{name}"] for name in ("motion", "changes", "frame_motion"))
+    near = np.maximum(0, 1 - np.abs(t * shifts.shape[1] - np.arange(shifts.shape[1])))
+    moved = np.einsum("b,nbc->nc", splines(motion.shape[1]), motion) + np.einsum("f,nfc->nc", near, shifts)
+    total, cfg = np.einsum("b,nbc->nc", splines(changes.shape[1]), changes), about["config"]["deformation"]
+    shape = cfg["deform_shape"]
+    widths = {"quats": 4 * shape, "log_scales": 3 * shape, "opacity_logits": 1 * cfg["deform_opacity"], "sh_dc": 3}
     ends = np.cumsum(list(widths.values()))
-    return {name: total[:, end - width : end] for (name, width), end in zip(widths.items(), ends, strict=True) if width}
+    parts = {
+        name: total[:, end - width : end] for (name, width), end in zip(widths.items(), ends, strict=True) if width
+    }
+    return {"means": moved} | parts
 
 
 def at(arrays, about, t, offsets=basis_offsets):

@@ -62,7 +62,8 @@ def moving_scene(sh_degree: int = 0, moving_camera: bool = False) -> Scene:
     gaussians = create_gaussians(points, rng.random((num, 3), np.float32), np.zeros(num, np.float32), cfg)
     with torch.no_grad():
         gaussians["opacity_logits"].fill_(4.0)
-        gaussians["motion"].copy_(torch.from_numpy(rng.normal(size=gaussians["motion"].shape) * 0.05))
+        for name in ("motion", "changes", "frame_motion"):
+            gaussians[name].copy_(torch.from_numpy(rng.normal(size=gaussians[name].shape) * 0.1))
         gaussians["sh_rest"].copy_(torch.from_numpy(rng.normal(size=gaussians["sh_rest"].shape) * 0.1))
         gaussians["color_slopes"].copy_(torch.from_numpy(rng.normal(size=gaussians["color_slopes"].shape) * 0.1))
     cameras = tuple(plane_camera(shift=i if moving_camera else 0.0) for i in range(NUM_FRAMES))

@@ -45,7 +45,8 @@ def random_scene(num: int, num_frames: int, seed: int = 0) -> Scene:
         gaussians["opacity_logits"].copy_(torch.from_numpy(rng.uniform(-3, 4, num)))
         gaussians["sh_rest"].copy_(torch.from_numpy(rng.normal(size=gaussians["sh_rest"].shape) * 0.1))
         gaussians["color_slopes"].copy_(torch.from_numpy(rng.normal(size=(num, 2, 3)) * 0.1))
-        gaussians["motion"].copy_(torch.from_numpy(rng.normal(size=gaussians["motion"].shape) * 0.15))
+        for name in ("motion", "changes"):
+            gaussians[name].copy_(torch.from_numpy(rng.normal(size=gaussians[name].shape) * 0.3))
     cameras = []
     for i in range(num_frames):
         pose = np.eye(4)

@@ -24,7 +24,7 @@ from endoprior.render import numba as numba_backend
 
 BENCH = Path(common.__file__).parent
 TINY = Size(40, 48, 40)
-REPEATED = 7
+REPEATED = 21
 """An iteration whose frame has a training frame before it."""
 
 

@@ -14,7 +14,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
-from endoprior.model.gaussians import motion_shape
+from endoprior.model.gaussians import temporal_shapes
 from endoprior.model.method import config_from, method_of
 from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import SceneFacts
@@ -78,10 +78,10 @@ def test_the_preset_default_is_that_of_the_class():
     assert preset("default") == Config()
 
 
-def test_there_are_at_most_73_fields():
-    # The last three: publications take all frames; whether a clip shows smoke is measured, and that can be wrong;
-    # each compared method is shown as released and fitted to the clip.
-    assert len(dict(leaves(to_dict(Config())))) <= 73
+def test_there_are_at_most_74_fields():
+    # The last four: publications take all frames; whether a clip shows smoke is measured, and that can be wrong;
+    # each compared method is shown as released and fitted to the clip; a scene knows its number of frames.
+    assert len(dict(leaves(to_dict(Config())))) <= 74
 
 
 def test_baseline_knows_no_prior():
@@ -95,13 +95,15 @@ def test_only_tuples_lists_and_plain_values_are_configured():
 
 
 def test_basis_functions_follow_the_length_of_the_sequence():
-    basis = BasisConfig(num_bases=0)
-    assert [basis.fitted(n).num_bases for n in (5, 24, 48, 63, 156)] == [4, 13, 27, 35, 87]
-    assert BasisConfig(num_bases=31).fitted(24).num_bases == 31
+    fitted = [BasisConfig().fitted(n) for n in (2, 5, 24, 48, 63, 156)]
+    assert [basis.num_bases for basis in fitted] == [4, 5, 13, 22, 28, 65]
+    assert [basis.num_change_bases for basis in fitted] == [4, 4, 8, 12, 15, 32]
+    assert [basis.num_frames for basis in fitted] == [2, 5, 24, 48, 63, 156]
+    assert BasisConfig(num_bases=31).fitted(24) == BasisConfig(31, 24)
     fitted = preset("default").fitted(48)
-    assert fitted.deformation.basis.num_bases == 27 and fitted.fitted(99) == fitted
-    with pytest.raises(ValueError, match="num_bases: expected at least 2"):
-        motion_shape(preset("default"))
+    assert fitted.deformation.basis.num_bases == 22 and fitted.fitted(99) == fitted
+    with pytest.raises(ValueError, match="num_bases: expected at least 4"):
+        temporal_shapes(preset("default"))
 
 
 @pytest.mark.parametrize("name", ["endogaussian", "paper", "released", "endogs", "endo4dgs"])
@@ -247,7 +249,8 @@ def test_what_the_version_before_stored_is_the_preset_of_today(name, told):
     stored = former(name)
     assert len(dict(leaves(stored))) == 141
     since = {"endogaussian": {"init.budget": 20_000}, "endo4dgs": {"render.depth_grad_to_means": False}}
-    former_values = {"render.photometric": "none"} | since.get(name, {})
+    basis_lr = {"optim.basis_lr": 0.01} if name in ("default", "best", "preview") else {}
+    former_values = {"render.photometric": "none"} | basis_lr | since.get(name, {})
     assert config_from(stored) == config_from(stored) == preset(name, **former_values)
     assert told() == (
         "endoprior: stored config: 80 of its fields are constants of this version, with the same values\n"

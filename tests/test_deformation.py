@@ -18,14 +18,14 @@ from torch import Tensor
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig
-from endoprior.model import motion as motion_module
-from endoprior.model.gaussians import motion_layout, motion_shape
+from endoprior.model.basis import basis_offsets, basis_weights, frame_weights, spline_weights
+from endoprior.model.gaussians import change_layout, temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField, OffsetHeads, box_of_points, head_shapes
-from endoprior.model.motion import Offsets, basis_offsets, basis_weights
+from endoprior.model.motion import Offsets
 from endoprior.model.ops import NUMBA
 
 SMALL = DeformationConfig(kind="hexplane", hexplane=planes((6, 5, 4), 8, 12, (1, 2)), max_scale_change=0.0)
-BASIS = Config(deformation=DeformationConfig(basis=BasisConfig(num_bases=9), max_scale_change=0.0))
+BASIS = Config(deformation=DeformationConfig(basis=BasisConfig(9, 12), max_scale_change=0.0))
 
 
 def points(num: int = 60, seed: int = 0) -> Tensor:
@@ -212,67 +212,90 @@ def test_time_moves_the_field_once_its_time_planes_differ() -> None:
     assert not torch.equal(model.offsets(cloud, 0.1, NUMBA).means, model.offsets(cloud, 0.99, NUMBA).means)
 
 
-def test_motion_layout_follows_the_configuration() -> None:
-    assert motion_layout(BASIS) == {
-        "means": slice(0, 3),
-        "quats": slice(3, 7),
-        "log_scales": slice(7, 10),
-        "sh_dc": slice(10, 13),
-    }
+def test_layout_of_changes_follows_the_configuration() -> None:
+    assert change_layout(BASIS) == {"quats": slice(0, 4), "log_scales": slice(4, 7), "sh_dc": slice(7, 10)}
     rigid = BASIS.replace({"deformation.deform_shape": False, "deformation.deform_opacity": True})
-    assert motion_layout(rigid) == {"means": slice(0, 3), "opacity_logits": slice(3, 4), "sh_dc": slice(4, 7)}
-    assert motion_shape(rigid.replace({"deformation.deform_opacity": False})) == (9, 6)
+    assert change_layout(rigid) == {"opacity_logits": slice(0, 1), "sh_dc": slice(1, 4)}
+    assert temporal_shapes(rigid) == {"motion": (9, 3), "changes": (6, 4), "frame_motion": (12, 3)}
     both = rigid.replace({"data.eyes": "both"})
-    assert motion_layout(both) == motion_layout(rigid) | {"gloss": slice(7, 10)}
+    assert change_layout(both) == change_layout(rigid) | {"gloss": slice(4, 7)}
 
 
-@pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999, 1.0])
+def coefficients(num: int, cfg: Config, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return {
+        name: torch.randn(num, *shape, generator=generator, dtype=dtype).requires_grad_(name != "frame_motion")
+        for name, shape in temporal_shapes(cfg).items()
+    }
+
+
+@pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999])
 def test_basis_by_its_definition(time: float) -> None:
     cfg = BASIS.replace({"deformation.deform_opacity": True, "data.eyes": "both"})
-    motion = torch.randn(300, 9, 17, generator=torch.Generator().manual_seed(1))
-    weights = reference_basis.weights(time, cfg.deformation.basis)
-    np.testing.assert_allclose(basis_weights(time, cfg.deformation.basis), weights, rtol=1e-12)
-    assert 0 in weights  # the cut is being tested
-    total = sum(w * motion[:, b].double() for b, w in enumerate(weights)).float()
-    got = basis_offsets(motion, time, cfg, NUMBA)
-    parts = [got.means, got.quats, got.log_scales, got.opacity_logits[:, None], got.sh_dc, got.gloss]
-    torch.testing.assert_close(torch.cat(parts, -1), total, rtol=1e-5, atol=1e-6)  # nine float32 terms
+    tensors = coefficients(300, cfg)
+    weights = {name: reference_basis.spline_weights(time, n) for name, n in (("motion", 9), ("changes", 6))}
+    weights["frame_motion"] = reference_basis.frame_weights(time, 12)
+    for name, values in basis_weights(time, cfg.deformation.basis).items():
+        np.testing.assert_allclose(values, weights[name], atol=1e-12)
+    totals = {
+        name: sum(w * tensors[name][:, b].double() for b, w in enumerate(values)).float()
+        for name, values in weights.items()
+    }
+    got = basis_offsets(tensors, time, cfg, NUMBA)
+    torch.testing.assert_close(got.means, totals["motion"] + totals["frame_motion"], rtol=1e-5, atol=1e-6)
+    parts = [got.quats, got.log_scales, got.opacity_logits[:, None], got.sh_dc, got.gloss]
+    torch.testing.assert_close(torch.cat(parts, -1), totals["changes"], rtol=1e-5, atol=1e-6)  # few float32 terms
 
 
-def test_a_basis_function_ends_at_three_standard_deviations_without_a_jump(monkeypatch) -> None:
-    monkeypatch.setattr(motion_module, "RELATIVE_WIDTH", 1.01)
-    cfg = BasisConfig(num_bases=101)  # sigma = 0.01 = distance of the centers
-    assert np.flatnonzero(basis_weights(0.5 + 1e-9, cfg)).tolist() == list(range(48, 54))
-    assert basis_weights(0.5, cfg)[50] == 1
-    assert basis_weights(0.505, cfg)[47] == 0
-    assert 0 < basis_weights(0.49999, cfg)[47] < 1e-4
-    assert not basis_weights(7.0, cfg).any()
+@pytest.mark.parametrize("count", [4, 5, 28])
+def test_splines_sum_to_one_and_four_have_a_weight(count: int) -> None:
+    for time in np.linspace(0, 1, 37):
+        weights = spline_weights(time, count)
+        assert weights.sum() == pytest.approx(1) and (weights >= 0).all() and np.count_nonzero(weights) <= 4
+    assert not spline_weights(7.0, count).any()
+
+
+@pytest.mark.parametrize("count", [1, 7, 49, 1000])
+def test_a_frame_has_its_own_displacement_and_none_of_its_neighbors(count: int) -> None:
+    for frame in range(count):
+        np.testing.assert_array_equal(frame_weights(frame / count, count), np.eye(count)[frame])
+    between = frame_weights(0.25 / count, count)
+    np.testing.assert_allclose(between[:2], [0.75, 0.25][:count])
+
+
+def test_the_spline_basis_is_well_conditioned() -> None:
+    """So that Adam, which scales every coefficient on its own, reaches fast motion as soon as slow motion."""
+    weights = np.stack([spline_weights(time, 40) for time in np.linspace(0, 1, 2000)])
+    eigenvalues = np.linalg.eigvalsh(weights.T @ weights)[6:]  # without functions that reach beyond the ends
+    assert eigenvalues[0] > 0.04 * eigenvalues[-1]
 
 
 def test_basis_gradient() -> None:
-    motion = torch.randn(3, 9, 13, dtype=torch.float64, requires_grad=True)
+    tensors = coefficients(3, BASIS, torch.float64)
 
-    def offsets(motion: Tensor) -> tuple[Tensor, ...]:
-        found = basis_offsets(motion, 0.4, BASIS, NUMBA)
+    def offsets(motion: Tensor, changes: Tensor) -> tuple[Tensor, ...]:
+        given = {"motion": motion, "changes": changes, "frame_motion": tensors["frame_motion"]}
+        found = basis_offsets(given, 0.4, BASIS, NUMBA)
         return found.means, found.quats, found.log_scales, found.sh_dc
 
-    assert torch.autograd.gradcheck(offsets, (motion,))
+    assert torch.autograd.gradcheck(offsets, (tensors["motion"], tensors["changes"]))
 
 
 def test_basis_starts_as_the_identity() -> None:
-    motion = torch.zeros(4, 9, 13, requires_grad=True)
-    found = basis_offsets(motion, 0.25, BASIS, NUMBA)
+    tensors = {name: torch.zeros(4, *shape, requires_grad=True) for name, shape in temporal_shapes(BASIS).items()}
+    found = basis_offsets(tensors, 0.25, BASIS, NUMBA)
     assert isinstance(found, Offsets) and found.opacity_logits is None
     assert not any(value.any() for value in (found.means, found.quats, found.log_scales, found.sh_dc))
     found.means.sum().backward()
-    assert motion.grad.any()  # and it can leave it
+    assert tensors["motion"].grad.any()  # and it can leave it
+    assert tensors["frame_motion"].grad is None  # which only optical flow gives
 
 
 def test_basis_of_no_gaussians_far_times_and_wrong_shapes() -> None:
-    motion = torch.zeros(0, 9, 13, requires_grad=True)
-    basis_offsets(motion, 0.5, BASIS, NUMBA).means.sum().backward()
-    assert motion.grad.shape == motion.shape
-    ones = torch.ones(2, 9, 13)
+    tensors = {name: torch.zeros(0, *shape, requires_grad=True) for name, shape in temporal_shapes(BASIS).items()}
+    basis_offsets(tensors, 0.5, BASIS, NUMBA).means.sum().backward()
+    assert tensors["motion"].grad.shape == tensors["motion"].shape
+    ones = {name: torch.ones(2, *shape) for name, shape in temporal_shapes(BASIS).items()}
     assert not basis_offsets(ones, 5.0, BASIS, NUMBA).means.any()
-    with pytest.raises(ValueError, match="motion"):
-        basis_offsets(ones[..., :-1], 0.5, BASIS, NUMBA)
+    with pytest.raises(ValueError, match="changes"):
+        basis_offsets(ones | {"changes": ones["changes"][..., :-1]}, 0.5, BASIS, NUMBA)

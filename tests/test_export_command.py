@@ -82,8 +82,7 @@ def test_scenes_where_nothing_but_the_centers_moves(tmp_path, name):
     scene = moving_scene()
     still = replace(scene.config.deformation, deform_shape=False)
     with torch.no_grad():
-        centers_and_color = scene.gaussians["motion"][:, :, [0, 1, 2, 10, 11, 12]]
-        scene.gaussians.tensors["motion"] = centers_and_color.contiguous().requires_grad_()
+        scene.gaussians.tensors["changes"] = scene.gaussians["changes"][:, :, 7:].contiguous().requires_grad_()  # color
     scene = replace(scene, config=replace(scene.config, deformation=still))
     scene.save(tmp_path / "run" / "scene.safetensors")
     assert export(tmp_path / "run", tmp_path / "out", name, "--times", "0.5") == 0

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 import torch
 
+from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, project
 from endoprior.core.types import Camera, Frame
 from endoprior.data import FrameSequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.score import ScoreUnavailable
 from endoprior.evaluation.scorers import motion
+from endoprior.model.basis import spline_weights
 from endoprior.model.colors import with_fixed_color
-from endoprior.model.gaussians import Gaussians, create_gaussians, motion_layout
-from endoprior.model.motion import basis_weights
+from endoprior.model.gaussians import Gaussians, change_layout, create_gaussians
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
@@ -33,7 +34,7 @@ def wall(shift_mm: float = 0.0, shade: float = 0.0) -> Scene:
     It reaches 30 px beyond the image. Nothing moves or changes at time 0.
     """
     cfg = preset("default").fitted(20)
-    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=replace(cfg.deformation.basis, num_bases=9)))
+    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=BasisConfig(9, NUM_FRAMES)))
     x, y = np.meshgrid(np.arange(-30, WIDTH + 30) + 0.5, np.arange(-30, HEIGHT + 30) + 0.5)
     pixels = np.column_stack([x.ravel(), y.ravel()])
     points = back_project(pixels, np.full(len(pixels), DEPTH), CAMERA).astype(np.float32)
@@ -41,12 +42,13 @@ def wall(shift_mm: float = 0.0, shade: float = 0.0) -> Scene:
     colors = np.repeat(rng.uniform(0.3, 0.5, (len(points), 1)), 3, 1)
     scales = np.full(len(points), np.log(0.4 * DEPTH / FOCAL), np.float32)
     gaussians = create_gaussians(points, colors.astype(np.float32), scales, cfg)
-    layout, weight = motion_layout(cfg), basis_weights(MIDDLE / NUM_FRAMES, cfg.deformation.basis)[4]
+    # Functions 4 of 9 and 3 of 6 have a weight in the middle and none at the start.
+    moves, shines = spline_weights(MIDDLE / NUM_FRAMES, 9)[4], spline_weights(MIDDLE / NUM_FRAMES, 6)[3]
     with torch.no_grad():
         gaussians["opacity_logits"].fill_(6.0)
-        gaussians["motion"][:, 4, layout["means"].start] = shift_mm / weight
-        shades = torch.from_numpy(shade * rng.uniform(0, 1, (len(points), 1)) / weight)
-        gaussians["motion"][:, 4, layout["sh_dc"]] = shades.float()
+        gaussians["motion"][:, 4, 0] = shift_mm / moves
+        shades = torch.from_numpy(shade * rng.uniform(0, 1, (len(points), 1)) / shines)
+        gaussians["changes"][:, 3, change_layout(cfg)["sh_dc"]] = shades.float()
     num = len(points)
     return SingleScene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, torch.zeros(num), torch.zeros(num))
 
@@ -101,12 +103,12 @@ def test_what_the_first_frame_hides_is_not_painted():
     scene = wall()
     pixels, _ = project(scene.gaussians["means"].detach().numpy(), CAMERA)
     strip = torch.from_numpy((pixels[:, 0] > 60) & (pixels[:, 0] < 100))
-    layout, behind = motion_layout(scene.config), wall().gaussians.tensors
+    behind = wall().gaussians.tensors
     tensors = {name: torch.cat([value, behind[name][strip]]) for name, value in scene.gaussians.tensors.items()}
     front = slice(len(scene), None)
     tensors["means"], tensors["motion"] = tensors["means"].detach(), tensors["motion"].detach()
     tensors["means"][front] *= 0.8
-    tensors["motion"][front, 4, layout["means"].start] = 100
+    tensors["motion"][front, 4, 0] = 100
     blue = painted(replace(scene, gaussians=Gaussians(tensors)), MIDDLE)
     assert np.abs(blue[:, 64:96]).max() < 1e-3 and blue[:, 4:56].max() > 0.1
 

@@ -14,8 +14,8 @@ from endoprior.core.geometry import back_project, pixel_centers, quaternion_to_m
 from endoprior.core.types import Camera, Frame
 from endoprior.initialization.first_gaussians import first_gaussians, flat_along, surface_normals
 from endoprior.initialization.sampling import PointCloud
-from endoprior.model.gaussians import create_gaussians
-from endoprior.model.motion import basis_offsets, basis_weights
+from endoprior.model.basis import basis_offsets, spline_weights
+from endoprior.model.gaussians import create_gaussians, temporal_shapes
 from endoprior.model.ops import NUMBA
 from endoprior.model.presets import preset
 from endoprior.training.step import MAX_SCALE_SHARE, largest_share, limit_scales
@@ -88,7 +88,7 @@ def test_the_third_axis_is_turned_to_the_normal() -> None:
 
 
 def test_a_start_keeps_its_shapes_and_opacities() -> None:
-    cfg = preset("default", **{"init.opacity": 0.2, "deformation.basis.num_bases": 4})
+    cfg = preset("default", **{"init.opacity": 0.2, "deformation.basis.num_bases": 4}).fitted(4)
     zeros, quats = np.zeros((2, 3)), np.tile([0.5, 0.5, 0.5, 0.5], (2, 1))
     made = create_gaussians(zeros, zeros, np.log([[2.0, 2, 0.5], [1, 3, 4]]), cfg, quats, np.array([0.9, 0.3]))
     np.testing.assert_allclose(made.scales.detach(), [[2, 2, 0.5], [1, 3, 4]], rtol=1e-6)
@@ -113,13 +113,15 @@ def test_the_first_gaussians_lie_flat_along_a_slanted_plane() -> None:
 
 
 def test_scales_over_time_stay_within_the_factor() -> None:
-    cfg = Config(deformation=DeformationConfig(kind="basis", basis=BasisConfig(num_bases=5), max_scale_change=1.5))
-    motion = torch.randn(20, 5, 13, generator=torch.Generator().manual_seed(0)) * 3
-    free = torch.einsum("nbc,b->nc", motion, torch.from_numpy(basis_weights(0.3, cfg.deformation.basis)).float())
-    offsets = basis_offsets(motion, 0.3, cfg, NUMBA)
+    cfg = Config(deformation=DeformationConfig(kind="basis", basis=BasisConfig(5), max_scale_change=1.5))
+    generator = torch.Generator().manual_seed(0)
+    tensors = {name: 3 * torch.randn(20, *shape, generator=generator) for name, shape in temporal_shapes(cfg).items()}
+    weights = {name: torch.from_numpy(spline_weights(0.3, n)).float() for name, n in (("motion", 5), ("changes", 4))}
+    means, free = (torch.einsum("nbc,b->nc", tensors[name], weights[name]) for name in weights)
+    offsets = basis_offsets(tensors, 0.3, cfg, NUMBA)
     limit = math.log(1.5)
-    torch.testing.assert_close(offsets.log_scales, free[:, 7:10].clamp(-limit, limit), atol=1e-5, rtol=0)
-    torch.testing.assert_close(offsets.means, free[:, :3], atol=1e-5, rtol=0)
+    torch.testing.assert_close(offsets.log_scales, free[:, 4:7].clamp(-limit, limit), atol=1e-5, rtol=0)
+    torch.testing.assert_close(offsets.means, means, atol=1e-5, rtol=0)
     assert offsets.log_scales.abs().max() == pytest.approx(limit)
 
 

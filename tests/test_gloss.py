@@ -16,7 +16,7 @@ from endoprior.core.types import Camera
 from endoprior.data import load_sequence
 from endoprior.footage.stereo_order import right_camera, share_of_right
 from endoprior.model.colors import with_fixed_color
-from endoprior.model.gaussians import Gaussians, motion_layout
+from endoprior.model.gaussians import Gaussians, change_layout
 from endoprior.model.highlights import without_highlights
 from endoprior.model.playback import Playback
 from endoprior.model.scene_file import load_scene
@@ -93,7 +93,7 @@ def test_gloss_is_saved_and_resumed(folder, tmp_path):
 
 def test_a_scene_from_before_there_was_gloss_has_one_color(scene, tmp_path):
     tensors = {name: value for name, value in scene.gaussians.tensors.items() if name != "gloss"}
-    tensors["motion"] = tensors["motion"][..., : motion_layout(scene.config)["gloss"].start]
+    tensors["changes"] = tensors["changes"][..., : change_layout(scene.config)["gloss"].start]
     replace(scene, gaussians=Gaussians(tensors), baseline_mm=0.0).save(tmp_path / "scene.safetensors")
     found = load_scene(tmp_path)
     time, right = FRAME / len(scene.cameras), right_camera(scene.cameras[FRAME], BASELINE)

@@ -11,9 +11,10 @@ import torch
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
+from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project
 from endoprior.core.types import Camera, Frame
-from endoprior.model.gaussians import SH_C0, create_gaussians, motion_layout
+from endoprior.model.gaussians import SH_C0, change_layout, create_gaussians
 from endoprior.model.highlights import without_highlights
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
@@ -27,16 +28,16 @@ TISSUE = np.array([0.6, 0.25, 0.2], np.float32)
 def wall(shine: Callable[[np.ndarray], np.ndarray]) -> Scene:
     """A red plane with a Gaussian for every second px; `shine` of the pixels (N, 2) says how white they are, (N, B)."""
     cfg = preset("default").fitted(NUM_FRAMES)
-    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=replace(cfg.deformation.basis, num_bases=NUM_BASES)))
+    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=BasisConfig(33, NUM_FRAMES)))
     x, y = np.meshgrid(np.arange(-8, WIDTH + 8, 2) + 0.5, np.arange(-8, HEIGHT + 8, 2) + 0.5)
     pixels = np.column_stack([x.ravel(), y.ravel()])
     points = back_project(pixels, np.full(len(pixels), 60.0), CAMERA).astype(np.float32)
     gaussians = create_gaussians(points, np.tile(TISSUE, (len(points), 1)), np.full(len(points), -0.5), cfg)
     with torch.no_grad():
         gaussians["opacity_logits"].fill_(6.0)
-        part = motion_layout(cfg)["sh_dc"]
+        part = change_layout(cfg)["sh_dc"]
         white = torch.from_numpy((1.05 - TISSUE) / SH_C0)
-        gaussians["motion"][:, :, part] = torch.from_numpy(shine(pixels)).float()[..., None] * white
+        gaussians["changes"][:, :, part] = torch.from_numpy(shine(pixels)).float()[..., None] * white
     num = len(points)
     return SingleScene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, torch.zeros(num), torch.zeros(num))
 
@@ -63,7 +64,7 @@ def moving(pixels: np.ndarray) -> np.ndarray:
 def resting(pixels: np.ndarray) -> np.ndarray:
     """A spot of light that never leaves."""
     inside = np.hypot(pixels[:, 0] - 40, pixels[:, 1] - 30) < 6
-    return np.repeat(inside[:, None], NUM_BASES, 1).astype(np.float32) / 1.5
+    return np.repeat(inside[:, None], NUM_BASES, 1).astype(np.float32) * 2.5
 
 
 @pytest.mark.parametrize("light", [moving, resting])
@@ -84,18 +85,18 @@ def test_all_else_stays_as_it_is():
     found = without_highlights(lit, lambda window: frames_of(lit))
     for name in ("means", "quats", "log_scales", "opacity_logits", "color_slopes"):
         assert torch.equal(found.gaussians[name], lit.gaussians[name])
-    part = motion_layout(lit.config)["sh_dc"]
-    assert torch.equal(found.gaussians["motion"][:, :, : part.start], lit.gaussians["motion"][:, :, : part.start])
+    part = change_layout(lit.config)["sh_dc"]
+    assert torch.equal(found.gaussians["changes"][:, :, : part.start], lit.gaussians["changes"][:, :, : part.start])
     dull = wall(lambda pixels: 0.1 * moving(pixels))
     same = without_highlights(dull, lambda window: frames_of(dull))
-    assert torch.equal(same.gaussians["motion"], dull.gaussians["motion"])
+    assert torch.equal(same.gaussians["changes"], dull.gaussians["changes"])
     assert torch.equal(same.gaussians["sh_dc"], dull.gaussians["sh_dc"])
 
 
 def test_what_no_frame_shows_is_left_alone():
     lit = wall(moving)
     found = without_highlights(lit, lambda window: frames_of(lit, hidden=slice(0, WIDTH)))
-    assert torch.equal(found.gaussians["motion"], lit.gaussians["motion"])
+    assert torch.equal(found.gaussians["changes"], lit.gaussians["changes"])
 
 
 def test_colors_that_never_change_have_no_highlights_to_find():

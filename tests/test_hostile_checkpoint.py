@@ -110,8 +110,8 @@ def test_tracks_of_another_sequence(tmp_path):
     """Tracks of fewer frames than the sequence has are named; those of all of them are taken over."""
     cfg = tiny_config("basis", coarse=0, fine=1).replace({"init.motion": "flow", "loss.track_weight": 0.01})
     taken = trainer, file, stored = trained(tmp_path, cfg)
-    assert resume(taken).state.tracks.followed.shape[1] == len(trainer.sequence.indices("train"))
-    followed = stored.arrays["tracks.followed"]
-    StateFile(stored.about, stored.arrays | {"tracks.followed": followed[:, 1:]}).write(file)
-    with pytest.raises(InputError, match=r"training frames in tracks\.followed"):
+    assert resume(taken).state.tracks.followed.shape[0] == len(trainer.sequence.indices("train"))
+    fewer = {name: stored.arrays[name][1:] for name in ("tracks.displacement", "tracks.followed")}
+    StateFile(stored.about, stored.arrays | fewer).write(file)
+    with pytest.raises(InputError, match=r"training frames in tracks\.displacement"):
         resume(taken)

@@ -24,7 +24,7 @@ from endoprior.evaluation.scorers.tracks import (
     without_motion,
 )
 from endoprior.evaluation.scoring import evaluate
-from endoprior.model.gaussians import Gaussians, motion_layout
+from endoprior.model.gaussians import Gaussians
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
@@ -58,8 +58,7 @@ def moved_world(scene, world):
     tensors["means"] = tensors["means"] @ turn.T + torch.from_numpy(world[:3, 3]).float()
     quats = Rotation.from_matrix(world[:3, :3]) * Rotation.from_quat(tensors["quats"].numpy(), scalar_first=True)
     tensors["quats"] = torch.from_numpy(quats.as_quat(scalar_first=True)).float()
-    layout = motion_layout(scene.config)
-    tensors["motion"][..., layout["means"]] = tensors["motion"][..., layout["means"]] @ turn.T
+    tensors["motion"], tensors["frame_motion"] = tensors["motion"] @ turn.T, tensors["frame_motion"] @ turn.T
     back = np.linalg.inv(world)
     cameras = tuple(replace(camera, world_to_camera=camera.world_to_camera @ back) for camera in scene.cameras)
     return replace(scene, gaussians=Gaussians(tensors), cameras=cameras)
@@ -82,9 +81,8 @@ def scene(phantom):
     trainer = GaussianTrainer(posed(phantom, path()), cfg)
     trainer.start()
     scene = trainer.scene()
-    layout = motion_layout(cfg)
     with torch.no_grad():
-        scene.gaussians["motion"][..., layout["means"]] = torch.tensor([0.4, -0.2, 0.3])
+        scene.gaussians["motion"][:] = torch.tensor([0.4, -0.2, 0.3])
     return scene
 
 

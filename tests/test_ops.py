@@ -118,7 +118,7 @@ def test_every_step_is_adam(ops):
         plain.grad = torch.from_numpy(weights).float()[:, None] * v_offsets[:, None]
         adam.step(want, plain.grad.double(), *moments, step, torch.from_numpy(rates))
         adam.step(plain_want, plain.grad.double(), *plain_moments, step, 1e-2)
-        ops.adam_basis_step(state, motion, [RankOneGradient(weights, v_offsets)], rates, 1e-15)
+        ops.adam_basis_step(state, motion, [RankOneGradient("motion", weights, v_offsets)], rates, 1e-15)
         ops.adam_step([plain_state], [plain], 1e-2, 1e-15)
     torch.testing.assert_close(motion.detach().double(), want, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(plain.detach().double(), plain_want, rtol=1e-4, atol=1e-6)
@@ -133,7 +133,7 @@ def test_a_skipped_step_changes_nothing():
         before += [plain.detach().clone(), motion.detach().clone()]
         plain.grad = torch.full_like(plain, value)
         TORCH.adam_step(states[:1], [plain], 1e-2, 1e-15, torch.tensor(skip))
-        gradient = RankOneGradient(np.array([0, 0.5, 1, 0]), torch.full((5, 3), value))
+        gradient = RankOneGradient("motion", np.array([0, 0.5, 1, 0]), torch.full((5, 3), value))
         TORCH.adam_basis_step(states[1], motion, [gradient], np.full(3, 1e-2), 1e-15, torch.tensor(skip))
         after = [t for s in states for t in s.arrays().values()] + [plain.detach(), motion.detach()]
         same = [torch.equal(a, b) for a, b in zip(before, after, strict=True)]

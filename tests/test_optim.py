@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from endoprior.core.config import OptimConfig
-from endoprior.model.gaussians import create_gaussians, motion_layout
+from endoprior.model.gaussians import change_layout, create_gaussians
 from endoprior.model.motion import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA
-from endoprior.training.optimizer import BASIS_DECAY, Optimizer, late_share, log_linear, motion_rates, rate_of
+from endoprior.training.optimizer import BASIS_DECAY, Optimizer, late_share, log_linear, rate_of, temporal_rates
 
 
 def test_update_is_torchs_adam():
@@ -36,7 +36,7 @@ def test_outer_product_gradients_are_the_written_out_ones():
     dense = motion.detach().clone().requires_grad_()
     state, adam = AdamState(motion, 4), AdamState(dense)
     for _ in range(5):
-        gradients = [RankOneGradient(rng.random(4).astype(np.float32), torch.randn(6, 3)) for _ in range(2)]
+        gradients = [RankOneGradient("motion", rng.random(4).astype(np.float32), torch.randn(6, 3)) for _ in range(2)]
         dense.grad = torch.from_numpy(sum(np.einsum("b,nc->nbc", g.weights, g.v_offsets.numpy()) for g in gradients))
         NUMBA.adam_basis_step(state, motion, gradients, np.full(3, 1e-2), 1e-15)
         NUMBA.adam_step([adam], [dense], 1e-2, 1e-15)
@@ -47,7 +47,7 @@ def test_basis_functions_without_weight_stay_unchanged():
     motion = torch.zeros(2, 4, 3).requires_grad_()
     state = AdamState(motion, 4)
     for weights in ([1.0, 0.5, 0, 0], [0, 0, 0.5, 1.0]):
-        gradient = RankOneGradient(np.array(weights, np.float32), torch.ones(2, 3))
+        gradient = RankOneGradient("motion", np.array(weights, np.float32), torch.ones(2, 3))
         NUMBA.adam_basis_step(state, motion, [gradient], np.array([1e-2, 1e-2, 0.0]), 1e-15)
     # Each was stepped once, so Adam's first step, of length lr, is all that happened; the last channel has rate 0.
     torch.testing.assert_close(motion.detach()[..., :2], torch.full((2, 4, 2), -1e-2))
@@ -81,10 +81,12 @@ def test_log_linear_ends_and_middle():
     assert [log_linear(1e-2, 1e-4, i, 10) for i in (0, 5, 10, 99)] == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
 
 
-def test_motion_rates_follow_the_layout():
-    cfg = preset("default")
-    layout = motion_layout(cfg)
-    rates = motion_rates(cfg, 0)
-    assert set(layout) == {"means", "quats", "log_scales", "sh_dc"} and len(rates) == 13
-    assert rates == pytest.approx(cfg.optim.basis_lr)
-    assert motion_rates(cfg, cfg.optim.decay_iterations) == pytest.approx(rates * BASIS_DECAY)
+def test_rates_of_temporal_coefficients_follow_the_layout():
+    cfg = preset("default", **{"deformation.deform_opacity": True})
+    assert set(change_layout(cfg)) == {"quats", "log_scales", "opacity_logits", "sh_dc"}
+    rates = {name: temporal_rates(name, cfg, 0) for name in ("motion", "changes")}
+    assert [len(each) for each in rates.values()] == [3, 11]
+    others = np.delete(rates["changes"], change_layout(cfg)["opacity_logits"])
+    assert others == pytest.approx(cfg.optim.basis_lr) and rates["motion"] == pytest.approx(cfg.optim.basis_lr)
+    for name, before in rates.items():
+        assert temporal_rates(name, cfg, cfg.optim.decay_iterations) == pytest.approx(before * BASIS_DECAY)

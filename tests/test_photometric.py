@@ -177,7 +177,7 @@ def test_stop_and_resume_equals_uninterrupted(smoky, tmp_path):
 
 @pytest.fixture
 def run(smoky, tmp_path):
-    train(load_sequence(smoky[0]), config(), tmp_path / "run")
+    train(load_sequence(smoky[0]), config(fine=30), tmp_path / "run")
     return tmp_path / "run"
 
 

@@ -46,7 +46,7 @@ def test_a_step_along_a_basis_is_that_of_the_whole_gradient(seed, num, bases, mo
     offsets = [rng.normal(size=(num, 3)).astype(np.float32) for _ in range(moments)]
     outer, flat = (torch.zeros(num, bases, 3, requires_grad=True) for _ in range(2))
     state, plain = AdamState(outer, bases), AdamState(flat)
-    found = [RankOneGradient(w, torch.from_numpy(v)) for w, v in zip(weights, offsets, strict=True)]
+    found = [RankOneGradient("motion", w, torch.from_numpy(v)) for w, v in zip(weights, offsets, strict=True)]
     for _ in range(3):
         NUMBA.adam_basis_step(state, outer, found, np.full(3, 1e-2), 1e-15)
         whole = sum(np.einsum("b,nc->nbc", w, v) for w, v in zip(weights, offsets, strict=True))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,11 +12,9 @@ from hypothesis_profiles import examples
 from render_scenes import camera
 
 from endoprior.compute.morton import morton_order
-from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, expected_depth, pixel_centers, project, quaternion_to_matrix
 from endoprior.data.pixels import shrunk_camera
-from endoprior.model import motion
-from endoprior.model.motion import basis_weights
+from endoprior.model.basis import frame_weights, spline_weights
 from endoprior.training.local_motion import neighbors_numba as neighbors
 
 SEEDS = st.integers(0, 2**31 - 1)
@@ -112,10 +109,15 @@ def test_a_shrunk_camera_keeps_its_field_of_view_up_to_what_was_cut_off(width, h
     assert -small.cx / small.fx == pytest.approx(-view.cx / view.fx)
 
 
-@given(st.integers(2, 60), st.floats(0, 1), st.floats(0.2, 5))
-def test_bumps_over_time_are_between_0_and_1(num, time, width):
-    with mock.patch.object(motion, "RELATIVE_WIDTH", width):
-        weights = basis_weights(time, BasisConfig(num_bases=num))
+@given(st.integers(4, 60), st.floats(0, 1))
+def test_splines_over_time_are_between_0_and_1_and_sum_to_1(num, time):
+    weights = spline_weights(time, num)
     assert weights.shape == (num,) and ((weights >= 0) & (weights <= 1)).all()
-    if width >= 1:
-        assert weights.max() > 0.3  # no moment is out of reach
+    assert weights.sum() == pytest.approx(1)
+
+
+@given(st.integers(1, 60), st.floats(0, 1))
+def test_shares_of_frames_are_those_of_linear_interpolation(num, time):
+    weights = frame_weights(time, num)
+    assert weights.shape == (num,) and ((weights >= 0) & (weights <= 1)).all()
+    np.testing.assert_allclose(weights, np.maximum(0, 1 - np.abs(time * num - np.arange(num))), atol=1e-8)

@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
-from endoprior.model.motion import basis_weights
 from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.tracks import StartTracks
 
-BASIS = BasisConfig(num_bases=6)
 CAMERA = Camera(320, 256, 300.0, 300.0, 160.0, 128.0, np.eye(4))
 FRAME = SimpleNamespace(time=0.4, camera=CAMERA, reliability=1.0)
 
@@ -27,28 +24,28 @@ def at_depth(*depths: float) -> torch.Tensor:
 
 def still_tracks(num: int, followed: list[list[float]]) -> StartTracks:
     """Tracks of points that do not move."""
-    return StartTracks(torch.zeros(num, 6, 3), torch.tensor(followed), torch.arange(num))
+    return StartTracks(torch.zeros(len(followed[0]), num, 3), torch.tensor(followed).T, torch.arange(num))
 
 
 def random_case(seed: int = 0):
     g = torch.Generator().manual_seed(seed)
     means = torch.randn(7, 3, generator=g) + torch.tensor([0.0, 0.0, 50.0])
     offsets = torch.randn(7, 3, generator=g, dtype=torch.float64).float().requires_grad_()
-    coefficients, followed = torch.randn(4, 6, 3, generator=g), torch.rand(4, 5, generator=g)
-    return means, offsets, StartTracks(coefficients, followed, torch.tensor([0, 1, 2, 3, 3, 1, 0]))
+    displacement, followed = torch.randn(5, 4, 3, generator=g), torch.rand(5, 4, generator=g)
+    return means, offsets, StartTracks(displacement, followed, torch.tensor([0, 1, 2, 3, 3, 1, 0]))
 
 
 def test_one_millimeter_at_a_known_depth():
     # 1 mm at 60 mm is 300 / 60 = 5 px of a frame 320 px wide, so 10 px of one 640 px wide.
     offsets = torch.tensor([[1.0, 0.0, 0.0]])
-    term = NUMBA.track_term(at_depth(60.0), offsets, still_tracks(1, [[1.0]]), FRAME, 0, BASIS)
+    term = NUMBA.track_term(at_depth(60.0), offsets, still_tracks(1, [[1.0]]), FRAME, 0)
     assert term.item() == pytest.approx(math.sqrt(10**2 + 1) - 1, rel=1e-5)
 
 
 def test_where_the_flow_lost_the_point_or_it_is_behind_the_camera_nothing_counts():
     offsets = torch.ones(2, 3, requires_grad=True)
     tracks = still_tracks(2, [[1.0, 0.0], [1.0, 1.0]])
-    term = NUMBA.track_term(at_depth(60.0, -60.0), offsets, tracks, FRAME, 1, BASIS)
+    term = NUMBA.track_term(at_depth(60.0, -60.0), offsets, tracks, FRAME, 1)
     term.backward()
     assert term.item() == 0 and not offsets.grad.any()
 
@@ -56,13 +53,13 @@ def test_where_the_flow_lost_the_point_or_it_is_behind_the_camera_nothing_counts
 @pytest.mark.parametrize("ops", [NUMBA, TORCH])
 def test_agrees_with_a_loop(ops):
     means, offsets, tracks = random_case()
-    total, weights = 0.0, basis_weights(FRAME.time, BASIS)
+    total = 0.0
     for n, row in enumerate(tracks.rows.tolist()):
-        wanted = sum(w * tracks.coefficients[row, b].double() for b, w in enumerate(weights))
+        wanted = tracks.displacement[3, row].double()
         px = 2 * 300 / (means[n, 2] + wanted[2]).item()
         error = px * (offsets[n].detach().double() - wanted).norm().item()
-        total += tracks.followed[row, 3].item() * (math.sqrt(error**2 + 1) - 1)
-    term = ops.track_term(means, offsets, tracks, FRAME, 3, BASIS)
+        total += tracks.followed[3, row].item() * (math.sqrt(error**2 + 1) - 1)
+    term = ops.track_term(means, offsets, tracks, FRAME, 3)
     assert term.item() == pytest.approx(total / 7, rel=1e-4)
 
 
@@ -70,22 +67,22 @@ def test_agrees_with_a_loop(ops):
 def test_gradient_goes_to_the_offsets_and_is_that_of_differences(ops):
     means, offsets, tracks = random_case(1)
     means.requires_grad_()
-    (2 * ops.track_term(means, offsets, tracks, FRAME, 2, BASIS)).backward()
+    (2 * ops.track_term(means, offsets, tracks, FRAME, 2)).backward()
     assert means.grad is None
     for n, axis in ((0, 0), (3, 1), (6, 2)):
         values = []
         for step in (1e-2, -1e-2):
             moved = offsets.detach().clone()
             moved[n, axis] += step
-            values.append(TORCH.track_term(means, moved, tracks, FRAME, 2, BASIS).item())
+            values.append(TORCH.track_term(means, moved, tracks, FRAME, 2).item())
         assert offsets.grad[n, axis].item() == pytest.approx(2 * (values[0] - values[1]) / 2e-2, rel=2e-2, abs=1e-4)
 
 
 def test_a_track_itself_costs_nothing():
     means, _, tracks = random_case(2)
-    offsets = NUMBA.model.weighted_sum(tracks.coefficients, basis_weights(FRAME.time, BASIS))[tracks.rows]
+    offsets = tracks.displacement[0][tracks.rows]
     offsets.requires_grad_()
-    term = NUMBA.track_term(means, offsets, tracks, FRAME, 0, BASIS)
+    term = NUMBA.track_term(means, offsets, tracks, FRAME, 0)
     term.backward()
     assert term.item() == 0 and not offsets.grad.any()
 
@@ -94,7 +91,7 @@ def test_children_keep_the_track_of_their_parent():
     _, _, tracks = random_case()
     grown = tracks.inherited(torch.tensor([6, 6, 2]))
     assert grown.rows.tolist() == [0, 0, 2]
-    assert grown.coefficients is tracks.coefficients
+    assert grown.displacement is tracks.displacement
 
 
 @pytest.mark.slow
@@ -107,8 +104,8 @@ def test_training_is_held_to_the_tracks(tiny_sequence):
             load_sequence(tiny_sequence), preset("default", gaussians=200, iterations=30, **changes)
         )
         trainer.start()
-        start = trainer.state.gaussians["motion"].detach()[..., :3].clone()
+        start = trainer.state.gaussians["motion"].detach().clone()
         assert (trainer.state.tracks is None) == (weight == 0)
         trainer.run([])
-        distance[weight] = (trainer.state.gaussians["motion"].detach()[..., :3] - start).abs().mean().item()
+        distance[weight] = (trainer.state.gaussians["motion"].detach() - start).abs().mean().item()
     assert distance[100.0] < 0.5 * distance[0.0]

@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 from conftest import write_tiny_sequence
 
 from endoprior.core.checks import InputError
@@ -19,7 +18,8 @@ from endoprior.data import load_sequence
 from endoprior.initialization import flow_tracks as tracks
 from endoprior.initialization.neighbor_motion import fill_gaps, smooth_motion
 from endoprior.initialization.sampling import PointCloud
-from endoprior.model.motion import basis_weights
+from endoprior.model.basis import basis_offsets, spline_weights
+from endoprior.model.ops import NUMBA
 from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
@@ -67,10 +67,10 @@ def test_coefficients_move_the_points_with_the_plane():
     frames = moving_frames((2.0, -1.0))
     cloud = cloud_at([(80.5, 60.5)], 3, frames[0].camera)
     cfg = BasisConfig(num_bases=7)
-    motion = tracks.initial_motion(frames, cloud, cfg).coefficients
-    assert motion.shape == (1, 7, 3)
+    motion = tracks.initial_motion(frames, cloud, cfg)
+    assert motion.coefficients.shape == (1, 7, 3) and motion.at_frames.shape == (1, NUM_FRAMES, 3)
     for frame in frames:
-        moved = cloud.points + np.tensordot(basis_weights(frame.time, cfg), motion, (0, 1))
+        moved = cloud.points + motion.displacement(spline_weights(frame.time, 7), frame.index)
         expected = cloud.points + (frame.index - 3) * np.array([2.0, -1.0, 0.0]) * DEPTH / 200
         np.testing.assert_allclose(moved, expected, atol=0.2)  # mm; half a pixel is 0.125 mm
 
@@ -239,8 +239,9 @@ def test_frames_too_small_for_flow_get_no_motion(caplog):
     cut = ("rgb_u8", "tissue_mask", "depth", "depth_valid")
     small = [replace(f, **{name: getattr(f, name)[:16] for name in cut}) for f in frames]
     cloud = cloud_at([(8.5, 8.5)], 0, frames[0].camera)
-    motion = tracks.initial_motion(small, cloud, BasisConfig(num_bases=4)).coefficients
-    assert motion.shape == (1, 4, 3) and not motion.any() and "too small" in caplog.text
+    motion = tracks.initial_motion(small, cloud, BasisConfig(num_bases=4))
+    assert motion.coefficients.shape == (1, 4, 3) and motion.at_frames.shape == (1, NUM_FRAMES, 3)
+    assert not motion.coefficients.any() and not motion.at_frames.any() and "too small" in caplog.text
 
 
 def test_training_starts_along_the_tracks(tmp_path):
@@ -249,12 +250,12 @@ def test_training_starts_along_the_tracks(tmp_path):
     trainer = GaussianTrainer(sequence, replace(cfg, init=replace(cfg.init, budget=300)))
     trainer.start()
     cfg = trainer.cfg
-    motion = trainer.state.gaussians["motion"].detach()
-    assert motion[..., :3].abs().amax() > 0.3  # mm; the plane slides by 3 mm
-    assert not motion[..., 3:].any()
+    gaussians = trainer.state.gaussians
+    assert gaussians["motion"].abs().amax() > 0.3  # mm; the plane slides by 3 mm
+    assert gaussians["frame_motion"][:, sequence.indices("train")].any() and not gaussians["changes"].any()
+    assert not gaussians["frame_motion"][:, sequence.indices("test")].any()  # which nothing reads
     # The points drift with the plane: most of the track's motion is theirs at every time.
-    moved = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.25, cfg.deformation.basis)).float(), motion)
-    still = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.75, cfg.deformation.basis)).float(), motion)
+    moved, still = (basis_offsets(gaussians.tensors, time, cfg, NUMBA).means.detach() for time in (0.25, 0.75))
     assert (moved - still)[:, 0].median() == pytest.approx(3.0, abs=1.0)
 
 

@@ -14,11 +14,13 @@ from endoprior.training.preflight import LEAST_BYTES, PICTURE_BYTES, least_bytes
 
 
 def test_by_hand():
-    cfg = tiny_config("basis").fitted(17)  # 300 Gaussians of degree 3, `num_bases` bumps
+    cfg = tiny_config("basis").fitted(17)  # 300 Gaussians of degree 3
     per_gaussian = 3 + 4 + 3 + 1 + 3 * 16
-    channels = 3 + 4 + 3 + 3 + cfg.deformation.deform_opacity
-    motion = cfg.deformation.basis.num_bases * channels
-    state = 3 * 4 * 300 * (per_gaussian + motion) + 2 * 4 * 300 * motion
+    channels = 4 + 3 + 3 + cfg.deformation.deform_opacity
+    basis = cfg.deformation.basis
+    motion, changes, frame_motion = basis.num_bases * 3, basis.num_change_bases * channels, 17 * 3
+    state = 3 * 4 * 300 * (per_gaussian + motion + changes) + 4 * 300 * frame_motion
+    state += 2 * 4 * 300 * max(per_gaussian, motion, changes, frame_motion)
     assert least_bytes(cfg, 300, 15, 48, 40) - LEAST_BYTES - PICTURE_BYTES * 48 * 40 >= state
     assert least_bytes(cfg, 300, 15, 48, 40) < LEAST_BYTES + PICTURE_BYTES * 48 * 40 + 2 * state
 

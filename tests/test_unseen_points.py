@@ -9,9 +9,10 @@ import pytest
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, pixel_centers, project
 from endoprior.core.types import Camera, Frame
+from endoprior.initialization.motion_fit import InitialMotion
 from endoprior.initialization.sampling import PointCloud, concatenated
 from endoprior.initialization.unseen import CELLS, convex_hull, laplace_fill, unseen_points
-from endoprior.model.motion import basis_weights
+from endoprior.model.basis import spline_weights
 
 WIDTH, HEIGHT = 320, 240
 SIZE = WIDTH // CELLS
@@ -45,8 +46,8 @@ def cloud_of(frames: list[Frame]) -> PointCloud:
     return concatenated(parts)
 
 
-def at_rest(frames: list[Frame], cloud: PointCloud) -> tuple[PointCloud, np.ndarray]:
-    return unseen_points(frames, cloud, np.zeros((len(cloud), 0, 3), np.float32), BASIS)
+def at_rest(frames: list[Frame], cloud: PointCloud) -> tuple[PointCloud, InitialMotion | None]:
+    return unseen_points(frames, cloud, None, BASIS)
 
 
 def test_convex_hull() -> None:
@@ -92,7 +93,7 @@ def test_everything_and_nothing_known() -> None:
 def test_behind_a_tool_that_stands_still_the_tissue_goes_on() -> None:
     frames = [frame(k, with_tool(slice(120, 200))) for k in range(4)]
     found, motion = at_rest(frames, cloud_of(frames))
-    assert motion.shape == (len(found), 0, 3) and len(found) == (80 // SIZE) ** 2
+    assert motion is None and len(found) == (80 // SIZE) ** 2
     pixels, z = project(found.points.astype(np.float64), CAMERA)
     np.testing.assert_allclose(z, 60 + 20 * pixels[:, 0] / WIDTH, rtol=0.01)
     np.testing.assert_allclose(found.colors, np.tile(COLOR / 255, (len(found), 1)), atol=1e-5)
@@ -125,12 +126,17 @@ def test_new_points_move_as_those_around() -> None:
     frames = [frame(k, with_tool(slice(120, 200))) for k in range(4)]
     cloud = cloud_of(frames)
     cloud = cloud.subset(cloud.origins == 0)
-    coefficients = np.zeros((len(cloud), 5, 3), np.float32)
-    coefficients[:] = np.random.default_rng(0).normal(size=(5, 3)) * 0.1
-    found, motion = unseen_points(frames, cloud, coefficients, BASIS)
-    np.testing.assert_allclose(motion, np.tile(coefficients[:1], (len(found), 1, 1)), atol=1e-6)
-    moved = found.points + np.tensordot(motion, basis_weights(0.0, BASIS), (1, 0))
-    first = moved[found.origins == 0]
+    rng, num = np.random.default_rng(0), len(cloud)
+    coefficients, at_frames = (
+        np.tile(0.1 * rng.normal(size=(1, n, 3)), (num, 1, 1)).astype(np.float32) for n in (5, 4)
+    )
+    given = InitialMotion(coefficients, at_frames, np.ones((num, 4), bool))
+    found, motion = unseen_points(frames, cloud, given, BASIS)
+    new = InitialMotion(*(part[num:] for part in (motion.coefficients, motion.at_frames, motion.followed)))
+    assert len(motion.followed) == num + len(found) and not new.followed.any()
+    np.testing.assert_allclose(new.coefficients, np.tile(coefficients[:1], (len(found), 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(new.at_frames, np.tile(at_frames[:1], (len(found), 1, 1)), atol=1e-6)
+    first = (found.points + new.displacement(spline_weights(0.0, 5), 0))[found.origins == 0]
     pixels, z = project(first.astype(np.float64), CAMERA)
     np.testing.assert_allclose(z, 60 + 20 * pixels[:, 0] / WIDTH, rtol=0.01)
 

@@ -38,7 +38,7 @@ CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """A wall of Gaussians at 50 mm that slides 2 mm to the right over the video."""
+    """A wall of Gaussians at 50 mm that slides 7 mm to the right over the video."""
     cfg: Config = preset("default").fitted(20)
     x, y = np.meshgrid(np.linspace(-24, 24, 40), np.linspace(-18, 18, 30))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 50.0)], -1).astype(np.float32)
@@ -46,7 +46,7 @@ def scene() -> Scene:
     gaussians = create_gaussians(points, colors, np.full(len(points), np.log(0.8), np.float32), cfg)
     with torch.no_grad():
         gaussians["opacity_logits"].fill_(3.0)
-        gaussians["motion"][:, :, 0] = torch.linspace(0, 2, gaussians["motion"].shape[1])
+        gaussians["motion"][:, :, 0] = torch.linspace(0, 7, gaussians["motion"].shape[1])
     score = torch.linspace(0, 1, len(points))
     return SingleScene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, score, torch.ones(len(points)))
 

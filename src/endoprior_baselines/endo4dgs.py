@@ -85,8 +85,8 @@ class Endo4DGS(Released):
         return rate_of(name, cfg, 1.0)
 
     @override
-    def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
-        return in_epochs(seed, stage, iteration, num_frames)
+    def position(self, cfg: Config, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
+        return in_epochs(cfg.seed, stage, iteration, num_frames)
 
     @override
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:

@@ -139,8 +139,8 @@ class EndoGS(Released):
         return lambda iteration: scale * log_linear(start, start, iteration, cfg.optim.decay_iterations)
 
     @override
-    def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
-        return in_epochs(seed, stage, iteration, num_frames)
+    def position(self, cfg: Config, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
+        return in_epochs(cfg.seed, stage, iteration, num_frames)
 
     @override
     def context(self, frames: TrainingFrames, cfg: Config) -> Tensor:

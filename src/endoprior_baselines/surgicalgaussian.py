@@ -210,8 +210,8 @@ class SurgicalGaussian(Released):
         return resting_spheres(grid_points(frames, EVERY_PX, FIRST_PX), cfg.init.opacity)
 
     @override
-    def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
-        return in_epochs(seed, stage, iteration, num_frames)
+    def position(self, cfg: Config, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
+        return in_epochs(cfg.seed, stage, iteration, num_frames)
 
     @override
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:

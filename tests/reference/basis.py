@@ -1,18 +1,23 @@
-"""The temporal basis, one function at a time."""
+"""Temporal basis functions, one at a time."""
 
 from __future__ import annotations
 
-import math
 
-from endoprior.core.config_deformation import BasisConfig
+def spline_weights(time: float, count: int) -> list[float]:
+    """Uniform cubic B-splines on [0, 1] by the recursion of Cox and de Boor, knots a span apart from -3 spans on."""
+    span = 1 / (count - 3)
+
+    def value(b: int, degree: int) -> float:
+        first = (b - 3) * span
+        if degree == 0:
+            return float(first <= time < first + span)
+        rise = (time - first) / (degree * span) * value(b, degree - 1)
+        fall = (first + (degree + 1) * span - time) / (degree * span) * value(b + 1, degree - 1)
+        return rise + fall
+
+    return [value(b, 3) for b in range(count)]
 
 
-def weights(time: float, cfg: BasisConfig) -> list[float]:
-    """w_b(t) = (exp(-(t - c_b)^2 / (2 s^2)) - e) / (1 - e) within three standard deviations, else 0."""
-    found = []
-    sigma, end = 1.5 / cfg.num_bases, math.exp(-4.5)
-    for b in range(cfg.num_bases):
-        center = b / (cfg.num_bases - 1)
-        inside = abs(time - center) <= 3 * sigma
-        found.append((math.exp(-((time - center) ** 2) / (2 * sigma**2)) - end) / (1 - end) if inside else 0.0)
-    return found
+def frame_weights(time: float, count: int) -> list[float]:
+    """1 at the frame's time, 0 at the times of the frames beside it, linear in between."""
+    return [max(0.0, 1 - abs(time - f / count) * count) for f in range(count)]

@@ -171,7 +171,7 @@ class OptimConfig(Checked):
     means_lr: DecayedRate = 5e-3
     """Initial rate of the centers, in units of the spatial scale of the sequence; a hundredth of it is left at
     `decay_iterations`. Higher finds the place sooner, too high blurs."""
-    basis_lr: Rate = 1e-2
+    basis_lr: Rate = 3e-2
     """Initial rate of the temporal coefficients, mm for the centers; a tenth of it is left at `decay_iterations`.
     Higher follows fast motion sooner, too high makes tissue tremble."""
     scales_lr: Rate = 2e-2
@@ -200,7 +200,8 @@ class ScheduleConfig(Checked):
     sh_every: Positive = 500
     """The degree in use rises by one each time this many iterations of a stage have passed."""
     literal: bool = False
-    """The schedule is a published one: when `iterations` changes, the numbers of what begins and ends stay."""
+    """The schedule is a published one. When `iterations` changes, the numbers of what begins and ends stay; and an
+    iteration takes any frame at random. Else each epoch takes every training frame once, in random order."""
 
     @property
     def total(self) -> int:

@@ -6,11 +6,14 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal
 
 from .checks import check_range
-from .ranges import Checked, Range
+from .ranges import Checked, Count, Range
 
-FRAMES_PER_BASIS = 1.8
-"""Frames of the sequence for each basis function; 1.5 to 3.5 are best, more functions follow held-out frames worse."""
-FEWEST_BASES, MOST_BASES = 4, 1000
+FRAMES_PER_SPAN = 2.5
+"""Frames between two knots of the splines of displacement. With 1.8 held-out frames follow worse where tissue rests."""
+CHANGE_SPANS = 0.46
+"""Spans of the splines of rotation, scale and color, which change more slowly, for each span of displacement."""
+DEGREE = 3  # of the splines: one with K spans between knots has K + DEGREE functions
+FEWEST_BASES, MOST_BASES = DEGREE + 1, 1000
 CELLS_PER_FRAME = 0.4
 """Cells of a HexPlane along time for each frame, where `fit_to_clip` is on: published are 0.79 and 0.32. With 0.5 every
 second frame can lie on a node of the planes, which only its neighbors pin where it is held out (docs/log.md)."""
@@ -44,20 +47,27 @@ class HexPlaneConfig(Checked):
 
 @dataclass(frozen=True)
 class BasisConfig(Checked):
-    """One coefficient per Gaussian, temporal basis function and channel: a linear map, no network."""
+    """Coefficients of each Gaussian for cubic B-splines over time: a linear map, no network."""
 
     num_bases: Annotated[int, Range(0, MOST_BASES)] = 0
-    """Basis functions over time. More follow faster motion, and frames that were not trained on less well; 0 takes one
-    for every 1.8 frames, at least 4."""
+    """Spline functions of the displacement; rotation, scale and color have about half as many. More follow faster
+    motion, and frames that were not trained on less well; 0 takes one for every 2.5 frames, and 3."""
+    num_frames: Count = 0
+    """Frames with a displacement of their own beside the spline, which optical flow gives; 0 takes all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("num_bases", self.num_bases or 2, 2, MOST_BASES)
+        check_range("num_bases", self.num_bases or FEWEST_BASES, FEWEST_BASES, MOST_BASES)
+
+    @property
+    def num_change_bases(self) -> int:
+        """Spline functions of rotation, scale and color."""
+        return max(round(CHANGE_SPANS * (self.num_bases - DEGREE)), 1) + DEGREE
 
     def fitted(self, num_frames: int) -> BasisConfig:
-        """This config with a number of basis functions, chosen for `num_frames` if there is none yet."""
-        chosen = min(max(round(num_frames / FRAMES_PER_BASIS), FEWEST_BASES), MOST_BASES)
-        return self if self.num_bases else replace(self, num_bases=chosen)
+        """This config with the numbers for `num_frames`, where none is chosen yet."""
+        chosen = min(max(round(num_frames / FRAMES_PER_SPAN), 1) + DEGREE, MOST_BASES)
+        return BasisConfig(self.num_bases or chosen, self.num_frames or num_frames)
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,7 @@ class DeformationConfig(Checked):
     """How canonical Gaussians move."""
 
     kind: Literal["hexplane", "basis"] = "basis"
-    """`basis`: temporal coefficients per Gaussian; `hexplane`: the paper's field."""
+    """`basis`: splines over time per Gaussian; `hexplane`: the paper's field."""
     hexplane: HexPlaneConfig = field(default_factory=HexPlaneConfig)
     basis: BasisConfig = field(default_factory=BasisConfig)
     deform_shape: bool = True

@@ -19,7 +19,8 @@ from ..core.config import Config
 from ..core.geometry import cells_at, project
 from ..core.types import Frame
 from ..system.memory import workers
-from .flow_tracks import InitialMotion, initial_motion
+from .flow_tracks import initial_motion
+from .motion_fit import InitialMotion
 from .sampling import PointCloud, concatenated, has_surface, initial_log_scales, initial_points
 from .unseen import unseen_points
 
@@ -129,10 +130,8 @@ def first_gaussians(frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
     num_seen = len(cloud)
     motion = initial_motion(frames, cloud, basis) if init.motion == "flow" else None
     if init.fill_unseen:
-        coefficients = motion.coefficients if motion else np.zeros((num_seen, 0, 3), np.float32)
-        unseen, coefficients = unseen_points(frames, cloud, coefficients, basis)
+        unseen, motion = unseen_points(frames, cloud, motion, basis)
         cloud = concatenated([cloud, unseen])
-        motion = motion and motion.joined(coefficients)
     first = replace(resting_spheres(cloud, init.opacity, init.variance_factor), motion=motion)
     first.opacities[num_seen:] = UNSEEN_OPACITY
     if init.thickness < 1:

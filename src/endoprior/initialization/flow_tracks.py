@@ -19,7 +19,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -32,7 +31,7 @@ from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
 from ..footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow, stuck
 from ..system.memory import workers
-from .motion_fit import fit_motion
+from .motion_fit import InitialMotion, fit_motion
 from .neighbor_motion import fill_gaps, smooth_motion
 from .sampling import PointCloud, has_surface
 
@@ -50,20 +49,6 @@ Flow = NDArray[np.float16]
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class InitialMotion:
-    """How N points move, and in which of T training frames the flow says so."""
-
-    coefficients: NDArray[np.float32]  # (N, B, 3) temporal coefficients of the centers, mm
-    followed: NDArray[np.bool_]
-    """(N, T) True where the flow found the point and returned to it; elsewhere its neighbors carried it."""
-
-    def joined(self, coefficients: NDArray[np.float32]) -> InitialMotion:
-        """This motion and that of further points, (M, B, 3) mm, which the flow never found."""
-        never = np.zeros((len(coefficients), self.followed.shape[1]), bool)
-        return InitialMotion(np.concatenate([self.coefficients, coefficients]), np.concatenate([self.followed, never]))
-
-
 def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> InitialMotion:
     """Temporal coefficients that move every point of the cloud along its track; 0 in frames too small for optical flow.
 
@@ -74,8 +59,8 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
     height, width = frames[0].tissue_mask.shape
     if min(height, width) < MIN_SIZE_PX:
         log.warning("initial motion: frames of %d x %d px are too small for optical flow", width, height)
-        nowhere = np.zeros((len(cloud), len(frames)), bool)
-        return InitialMotion(np.zeros((len(cloud), cfg.num_bases, 3), np.float32), nowhere)
+        coefficients, at_frames = (np.zeros((len(cloud), n, 3), np.float32) for n in (cfg.num_bases, len(frames)))
+        return InitialMotion(coefficients, at_frames, np.zeros((len(cloud), len(frames)), bool))
     positions = lift(frames, track_points(frames, cloud.points.astype(np.float64), cloud.origins))
     followed = np.isfinite(positions[..., 0]).T.copy()
     log.info("initial motion: points are followed in %.0f %% of the frames", 100 * followed.mean())
@@ -83,7 +68,7 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
     offsets = smooth_motion(fill_gaps(positions), cloud.origins)
     rays = cloud.points - np.stack([frame.camera.center for frame in frames])[cloud.origins]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return InitialMotion(fit_motion(offsets, rays, [frame.time for frame in frames], cfg), followed)
+    return InitialMotion(*fit_motion(offsets, rays, [frame.time for frame in frames], cfg), followed)
 
 
 def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float32]:

@@ -1,36 +1,76 @@
-"""Fit temporal coefficients to tracks: as they are across the ray of a point's source pixel, smoothly along it.
+"""Fit temporal coefficients to tracks: splines that bend as little as cross-validation allows, and what they leave.
 
-Measured depth errs by ten times as much as flow does, and its errors move a point along the ray. Followed as they are,
-they make tissue that rests tremble. So what moves along the ray bends as little as cross-validation allows: not at all
-where depth is noise, freely where tissue moves. `T` frames, `N` points, `B` basis functions.
+Across the ray of a point's source pixel tracks are almost free of noise: what the spline does not follow there, such as
+the shake of a camera, stays with the frame that shows it, and a held-out frame in between keeps to the spline. Along
+the ray measured depth errs by ten times as much as flow does. Followed as it is, it makes tissue that rests tremble; so
+along it there is the spline alone, stiff where depth is noise and free where tissue moves. `T` frames, `N` points, `B`
+basis functions.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config_deformation import BasisConfig
-from ..model.motion import basis_weights
+from ..model.basis import spline_weights
 
 RIDGE = 1e-5  # ridge term of least squares; each frame has weight 1
-STIFFNESS = tuple(10.0 ** np.arange(-0.5, 4.1, 0.5))
+STIFFNESS = tuple(10.0 ** np.arange(-1.5, 4.1, 0.5))
 """Weights, relative to a frame, of the squared second difference along time, in steps of the median time between
 frames. The stiffest leaves little more than a straight line."""
 
 
+@dataclass(frozen=True)
+class InitialMotion:
+    """How N points move, and in which of T training frames the flow says so."""
+
+    coefficients: NDArray[np.float32]  # (N, B, 3) of the spline of their displacement, mm
+    at_frames: NDArray[np.float32]  # (N, T, 3) displacement in each frame beside the spline, mm
+    followed: NDArray[np.bool_]
+    """(N, T) True where the flow found the point and returned to it; elsewhere its neighbors carried it."""
+
+    def displacement(self, weights: NDArray, position: int) -> NDArray:
+        """(N, 3) mm in training frame number `position`, at whose time the spline functions have `weights` (B,)."""
+        return np.tensordot(self.coefficients, weights, (1, 0)) + self.at_frames[:, position]
+
+    def of(self, rows: NDArray[np.integer], shares: NDArray[np.floating]) -> InitialMotion:
+        """Motion of M further points, which the flow never found: the mean of those `rows` (M, k), by `shares`."""
+        coefficients, at_frames = (
+            np.einsum("mk,mkbc->mbc", shares, values[rows]).astype(np.float32)
+            for values in (self.coefficients, self.at_frames)
+        )
+        return InitialMotion(coefficients, at_frames, np.zeros((len(rows), self.followed.shape[1]), bool))
+
+    @staticmethod
+    def joined(parts: Sequence[InitialMotion]) -> InitialMotion:
+        """The motion of all points of several parts."""
+        names = ("coefficients", "at_frames", "followed")
+        return InitialMotion(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
 def fit_motion(
     offsets: NDArray[np.floating], rays: NDArray[np.floating], times: list[float], cfg: BasisConfig
-) -> NDArray[np.float32]:
-    """Coefficients (N, B, 3) of offsets (T, N, 3) mm at T `times` in [0, 1], smooth along the unit `rays` (N, 3)."""
-    weights = np.stack([basis_weights(time, cfg) for time in times])
-    plain = solver(weights, times, 0.0)
-    coefficients = (plain @ offsets.reshape(len(times), -1)).reshape(cfg.num_bases, -1, 3)
-    if len(times) > 2:
-        along = np.einsum("tnc,nc->tn", offsets, rays)
-        smooth = solver(weights, times, best_stiffness(along, weights, times))
-        coefficients += ((smooth - plain) @ along)[..., None] * rays
-    return np.ascontiguousarray(coefficients.transpose(1, 0, 2), np.float32)
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`coefficients` and `at_frames` of `InitialMotion`.
+
+    Args:
+        offsets: (T, N, 3) displacement, mm, at the T `times` in [0, 1]. rays: (N, 3) unit vectors along the ray.
+    """
+    weights = np.stack([spline_weights(time, cfg.num_bases) for time in times])
+    along = np.einsum("tnc,nc->tn", offsets, rays)
+    across = (offsets - along[..., None] * rays).reshape(len(times), -1)
+    of_ray, of_rest = (
+        solver(weights, times, best_stiffness(values, weights, times) if len(times) > 2 else 0.0) @ values
+        for values in (along, across)
+    )
+    left = (across - weights @ of_rest).reshape(offsets.shape)
+    coefficients = of_rest.reshape(cfg.num_bases, -1, 3) + of_ray[..., None] * rays
+    by_point = [np.ascontiguousarray(part.transpose(1, 0, 2), np.float32) for part in (coefficients, left)]
+    return by_point[0], by_point[1]
 
 
 def solver(weights: NDArray[np.floating], times: list[float], stiffness: float) -> NDArray[np.floating]:

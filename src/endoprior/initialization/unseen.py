@@ -22,7 +22,8 @@ from scipy.spatial import KDTree
 from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
-from ..model.motion import basis_weights
+from ..model.basis import spline_weights
+from .motion_fit import InitialMotion
 from .neighbor_motion import CARRIERS, weights_by_distance
 from .sampling import PointCloud, concatenated, eroded_mask, has_surface
 
@@ -31,37 +32,35 @@ RIM_PX = 9  # width of the rim along tools, in px of an image 640 px wide, whose
 
 
 def unseen_points(
-    frames: Sequence[Frame], cloud: PointCloud, coefficients: NDArray[np.float32], cfg: BasisConfig
-) -> tuple[PointCloud, NDArray[np.float32]]:
-    """New points, and their temporal coefficients (M, B, 3), mm.
+    frames: Sequence[Frame], cloud: PointCloud, motion: InitialMotion | None, cfg: BasisConfig
+) -> tuple[PointCloud, InitialMotion | None]:
+    """New points; and the motion of all, theirs last: they move as those around them.
 
     Args:
         frames: the T training frames that the cloud comes from.
-        coefficients: (N, B, 3) motion of its points, mm; B may be 0: nothing moves.
+        motion: of its points; None: nothing moves.
     """
     size = _cell_size(frames[0])
     within = convex_hull(np.any([_cell_sums(frame.tissue_mask, size) > 0 for frame in frames], axis=0))
-    found, motions = [], [coefficients[:0]]
+    found, motions = list[PointCloud](), list[InitialMotion]()
     for position, frame in enumerate(frames):
-        weights = basis_weights(frame.time, cfg) if coefficients.shape[1] else np.zeros(0)
-        moved = cloud.points + _displacement(coefficients, weights)
-        added = [part.points + _displacement(motion, weights) for part, motion in zip(found, motions[1:], strict=True)]
+        weights = spline_weights(frame.time, cfg.num_bases)
+        moved = cloud.points if motion is None else cloud.points + motion.displacement(weights, position)
+        added = [part.points for part in found]
+        if motion is not None:
+            added = [points + its.displacement(weights, position) for points, its in zip(added, motions, strict=True)]
         new, colors = _fill(frame, np.concatenate([moved, *added]), within)
         if not len(new):
             continue
-        distances, nearest = KDTree(moved).query(new, k=min(CARRIERS, len(moved)))
-        near = weights_by_distance(np.reshape(distances, (len(new), -1)).astype(np.float64))
-        carriers = coefficients[np.reshape(nearest, (len(new), -1))]
-        motion = np.einsum("mk,mkbc->mbc", near, carriers).astype(np.float32)
-        points = (new - _displacement(motion, weights)).astype(np.float32)
-        found.append(PointCloud(points, colors.astype(np.float32), np.full(len(new), position, np.int32)))
-        motions.append(motion)
-    return concatenated(found), np.concatenate(motions)
-
-
-def _displacement(coefficients: NDArray, weights: NDArray) -> NDArray:
-    """(N, 3) mm, at the time of the `weights` (B,)."""
-    return np.tensordot(coefficients, weights, (1, 0))
+        points = new
+        if motion is not None:
+            distances, nearest = KDTree(moved).query(new, k=min(CARRIERS, len(moved)))
+            near = weights_by_distance(np.reshape(distances, (len(new), -1)).astype(np.float64))
+            motions.append(motion.of(np.reshape(nearest, (len(new), -1)), near))
+            points = new - motions[-1].displacement(weights, position)
+        origins = np.full(len(new), position, np.int32)
+        found.append(PointCloud(points.astype(np.float32), colors.astype(np.float32), origins))
+    return concatenated(found), motion and InitialMotion.joined([motion, *motions])
 
 
 def _cell_size(frame: Frame) -> int:

@@ -16,7 +16,7 @@ _AHEAD = 8  # Gaussians between asking for the coefficients of one and reading t
 
 
 def weighted_sum(motion: Tensor, weights: NDArray) -> Tensor:
-    """See `motion.weighted_sum`."""
+    """See `basis.weighted_sum`."""
     coefficients = motion.contiguous().numpy()
     out = np.empty((len(coefficients), coefficients.shape[2]), dtype=coefficients.dtype)
     _weighted_sum(coefficients, weights.astype(out.dtype), *_support(weights), out)
@@ -24,7 +24,7 @@ def weighted_sum(motion: Tensor, weights: NDArray) -> Tensor:
 
 
 def weighted_sum_backward(v_out: Tensor, weights: NDArray) -> Tensor:
-    """See `motion.weighted_sum_backward`."""
+    """See `basis.weighted_sum_backward`."""
     gradient = v_out.contiguous().numpy()
     v_motion = np.zeros((len(gradient), len(weights), gradient.shape[1]), dtype=gradient.dtype)
     _weighted_sum_backward(gradient, weights.astype(gradient.dtype), *_support(weights), v_motion)

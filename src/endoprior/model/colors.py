@@ -20,15 +20,15 @@ from torch import Tensor
 
 from .. import render
 from ..core.types import Camera, Splats
-from .gaussians import SH_C0, Gaussians, motion_layout
-from .motion import basis_weights
+from .basis import spline_weights
+from .gaussians import SH_C0, Gaussians, change_layout
 from .scene import Scene, Window
 from .single_scene import SingleScene
 
 
 def changes_color(scene: Scene) -> bool:
     """Whether the colors of its Gaussians can change with time."""
-    return "sh_dc" in motion_layout(scene.config)
+    return "sh_dc" in change_layout(scene.config)
 
 
 def with_fixed_color(scene: Scene, times: Sequence[float]) -> Scene:
@@ -48,16 +48,16 @@ def with_fixed_color(scene: Scene, times: Sequence[float]) -> Scene:
 
 
 def _fixed(scene: SingleScene, times: NDArray[np.float64]) -> SingleScene:
-    tensors, layout = dict(scene.gaussians.tensors), motion_layout(scene.config)
-    weights = np.mean([basis_weights(time, scene.config.deformation.basis) for time in times], axis=0)
-    motion = tensors["motion"].detach().clone()
+    tensors, layout = dict(scene.gaussians.tensors), change_layout(scene.config)
+    changes = tensors["changes"].detach().clone()
+    weights = np.mean([spline_weights(time, changes.shape[1]) for time in times], axis=0)
     for name in layout.keys() & {"sh_dc", "gloss"}:
-        colors = motion[:, :, layout[name]]  # a view: what is set to zero below is part of `motion`
+        colors = changes[:, :, layout[name]]  # a view: what is set to zero below is part of `changes`
         mean = torch.einsum("b,nbc->nc", torch.as_tensor(weights).to(colors), colors)
         tensors[name] = tensors[name].detach().clone()
         tensors[name][:, 0] += mean
         colors.zero_()
-    return replace(scene, gaussians=Gaussians(tensors | {"motion": motion}))
+    return replace(scene, gaussians=Gaussians(tensors | {"changes": changes}))
 
 
 ITERATIONS, FEW_ITERATIONS = 20, 5

@@ -48,7 +48,7 @@ ATTRIBUTES = (
     Attribute("color_slopes", 3),
     Attribute("gloss", 3),
 )
-"""Every attribute but `motion`, the temporal coefficients of the others. The channels of `motion` and the heads of a
+"""Every attribute but the temporal coefficients (`temporal_shapes`). The channels of `changes` and the heads of a
 HexPlane field follow this order."""
 
 
@@ -57,31 +57,38 @@ def offset_widths(cfg: DeformationConfig) -> dict[str, int]:
     return {a.name: a.width for a in ATTRIBUTES if a.changes(cfg)}
 
 
-def motion_widths(cfg: Config) -> dict[str, int]:
-    """`offset_widths`, and what the right eye sees more if both are trained on: only coefficients change that."""
-    widths = offset_widths(cfg.deformation)
-    return widths | {"gloss": 3} if cfg.data.eyes == "both" else widths
+def change_layout(cfg: Config) -> dict[str, slice]:
+    """Channels of `changes`, the temporal coefficients of all attributes but the centers, by attribute.
 
-
-def motion_layout(cfg: Config) -> dict[str, slice]:
-    """Channels of `motion` by the attribute that they change."""
+    If both eyes are trained on, also of what the right eye sees more: only coefficients change that.
+    """
+    widths = offset_widths(cfg.deformation) | ({"gloss": 3} if cfg.data.eyes == "both" else {})
     layout, start = {}, 0
-    for name, width in motion_widths(cfg).items():
-        layout[name] = slice(start, start + width)
-        start += width
+    for name, width in widths.items():
+        if name != "means":
+            layout[name] = slice(start, start + width)
+            start += width
     return layout
 
 
-def motion_shape(cfg: Config) -> tuple[int, int]:
-    """Basis functions and channels of `motion`.
+def temporal_shapes(cfg: Config) -> dict[str, tuple[int, int]]:
+    """Basis functions and channels of the tensors that `basis.py` moves Gaussians by.
+
+    `motion`: displacement of the centers, mm, by spline functions; `changes`: see `change_layout`, by fewer of them;
+    `frame_motion`: displacement at each frame beside the spline, mm, which is not trained by gradients.
 
     Raises:
         InputError: the config leaves the number of temporal basis functions open.
     """
-    num_bases = cfg.deformation.basis.num_bases
-    if num_bases == 0:
-        raise InputError("config.deformation.basis.num_bases: expected at least 2; got 0.")
-    return num_bases, sum(motion_widths(cfg).values())
+    basis = cfg.deformation.basis
+    if basis.num_bases == 0:
+        raise InputError("config.deformation.basis.num_bases: expected at least 4; got 0.")
+    channels = max((part.stop for part in change_layout(cfg).values()), default=0)
+    return {
+        "motion": (basis.num_bases, 3),
+        "changes": (basis.num_change_bases, channels),
+        "frame_motion": (basis.num_frames, 3),
+    }
 
 
 def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:

@@ -21,9 +21,9 @@ from ..core.checks import InputError
 from ..core.geometry import cells_at
 from ..core.types import Frame
 from ..priors.specular import specular_likelihood
+from .basis import spline_weights
 from .colors import changes_color
-from .gaussians import SH_C0, Gaussians, motion_layout
-from .motion import basis_weights
+from .gaussians import SH_C0, Gaussians, change_layout
 from .scene import Scene
 from .single_scene import SingleScene
 from .surface import FramesOf, project_visible, render_surface
@@ -69,29 +69,29 @@ def _refitted_scene(scene: SingleScene, frames: Iterable[Frame]) -> SingleScene:
     """Args: frames: those it was trained on."""
     free, times = _free_of_highlights(scene, frames)
     cfg, tensors = scene.config, dict(scene.gaussians.tensors)
-    part = motion_layout(cfg)["sh_dc"]
-    motion, sh_dc = tensors["motion"].detach().clone(), tensors["sh_dc"].detach().clone()
-    basis = torch.as_tensor(np.stack([basis_weights(t, cfg.deformation.basis) for t in times])).to(motion)
-    weights = torch.as_tensor(np.where(np.isnan(free), UNSEEN, free)).to(motion)
+    part = change_layout(cfg)["sh_dc"]
+    changes, sh_dc = tensors["changes"].detach().clone(), tensors["sh_dc"].detach().clone()
+    basis = torch.as_tensor(np.stack([spline_weights(t, changes.shape[1]) for t in times])).to(changes)
+    weights = torch.as_tensor(np.where(np.isnan(free), UNSEEN, free)).to(changes)
     touched = np.nanmin(free, axis=1, initial=1) < 1 - UNTOUCHED
     chunk = max(LARGEST_CHUNK // (max(basis.shape) * basis.shape[1]), 1)
-    for some in torch.from_numpy(np.flatnonzero(touched)).to(motion.device).split(chunk):
-        sh_dc[some, 0], motion[some, :, part] = _refitted(
-            sh_dc[some, 0], motion[some][:, :, part], basis, weights[some]
+    for some in torch.from_numpy(np.flatnonzero(touched)).to(changes.device).split(chunk):
+        sh_dc[some, 0], changes[some, :, part] = _refitted(
+            sh_dc[some, 0], changes[some][:, :, part], basis, weights[some]
         )
     means = tensors["means"].detach().cpu().numpy()
     known = np.asarray(np.nansum(free, axis=1) >= LEAST_FRAMES)
     never_seen = np.asarray(np.isnan(free).all(1))
-    unseen = torch.from_numpy(never_seen).to(motion.device)
-    for new, old in ((sh_dc, tensors["sh_dc"]), (motion[:, :, part], tensors["motion"][:, :, part])):
+    unseen = torch.from_numpy(never_seen).to(changes.device)
+    for new, old in ((sh_dc, tensors["sh_dc"]), (changes[:, :, part], tensors["changes"][:, :, part])):
         _take_from_neighbors(means, known, np.asarray(touched & ~known), new)
         taken = new - old.detach()
         _take_from_neighbors(means, ~never_seen, never_seen, taken)
         new[unseen] += taken[unseen]
     if tensors.pop("gloss", None) is not None:  # the right eye sees the same tissue
-        motion = motion[:, :, : motion_layout(cfg)["gloss"].start]
+        changes = changes[:, :, : change_layout(cfg)["gloss"].start]
         cfg = replace(cfg, data=replace(cfg.data, eyes="left"))
-    gaussians = Gaussians(tensors | {"sh_dc": sh_dc, "motion": motion})
+    gaussians = Gaussians(tensors | {"sh_dc": sh_dc, "changes": changes})
     return replace(scene, gaussians=gaussians, config=cfg, baseline_mm=0.0)
 
 

@@ -1,13 +1,8 @@
-"""How Gaussians move: offsets at a time, what is trained for them, and the temporal basis, our own way to move.
+"""How Gaussians move: offsets at a time, what is trained for them, and what a training step leaves for the optimizer.
 
 Two ways to hold motion, and a method may use both: tensors of each Gaussian, which follow it when it is cloned, split
-or removed; and a `Field` that all Gaussians share (`hexplane_field.py` has the paper's). Offsets are added to the raw
-parameters: centers (mm), log scales, quaternions before normalization, opacity logits.
-
-Temporal basis: offset_i(t) = sum_b w_b(t) motion_i,b with w_b(t) = max(0, (exp(-d^2 / 2) - e) / (1 - e)),
-d = (t - c_b) / s and e = exp(-3^2 / 2): a Gaussian, lowered by 0.011 so that its support ends at three standard
-deviations without a jump. Centers c_b lie evenly on [0, 1], s = 1.5 / B. Zero coefficients are the identity.
-Yang et al., "Deform3DGS", MICCAI 2024, use a basis of this kind per Gaussian.
+or removed (`basis.py` has ours); and a `Field` that all Gaussians share (`hexplane_field.py` has the paper's). Offsets
+are added to the raw parameters: centers (mm), log scales, quaternions before normalization, opacity logits.
 """
 
 from __future__ import annotations
@@ -22,24 +17,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd.function import once_differentiable
-from typing_extensions import override
 
-from ..core.checks import check_shape
 from ..core.config import Config
-from ..core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
+from ..core.config_deformation import DeformationConfig, HexPlaneConfig
 from ..system.arrays_file import ArraySpec
-from .gaussians import attribute_shapes, motion_shape, motion_widths
+from .gaussians import attribute_shapes
 
 if TYPE_CHECKING:
     from .gaussians import Gaussians
     from .hexplane import PlaneGrid
     from .ops import ModelOps
-
-RELATIVE_WIDTH = 1.5
-"""Standard deviation of a basis function in units of 1 / B."""
-SUPPORT = 3.0
-"""Half of the support of a basis function, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +50,7 @@ class Offsets:
 
     @staticmethod
     def from_channels(channels: dict[str, Tensor], cfg: DeformationConfig) -> Offsets:
-        """Offsets from tensors (N, width) by name, as `motion_widths` names them; scales within bounds."""
+        """Offsets from tensors (N, width) by name, as `gaussians.offset_widths` names them; scales within bounds."""
         if "opacity_logits" in channels:
             channels["opacity_logits"] = channels["opacity_logits"][:, 0]
         if "log_scales" in channels and cfg.max_scale_change > 1:
@@ -171,70 +158,19 @@ class Motion(ABC):
         return {name: ArraySpec("float32", shape) for name, shape in shapes.items()}
 
 
-class BasisMotion(Motion):
-    """Ours: temporal coefficients of each Gaussian."""
-
-    stays_at_the_ends = True  # a temporal basis that no frame holds leads anywhere
-
-    def tensors(self, cfg: Config) -> dict[str, tuple[int, ...]]:
-        """See `Motion.tensors`."""
-        return {"motion": motion_shape(cfg)}
-
-    @override
-    def offsets(
-        self,
-        gaussians: Gaussians,
-        field: Field | None,
-        time: float,
-        cfg: Config,
-        ops: ModelOps,
-        chosen: Tensor | None = None,
-    ) -> Offsets:
-        """See `Motion.offsets`. Unless some are chosen, the gradient goes to `gaussians.motion_gradients`."""
-        rows = slice(None) if chosen is None else chosen
-        sink = gaussians.motion_gradients if chosen is None else None
-        return basis_offsets(gaussians["motion"][rows], time, cfg, ops, sink)
-
-
-def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
-    """(B,) values w_b(t) of the basis functions, in [0, 1]."""
-    distance = time - np.linspace(0, 1, cfg.num_bases)
-    sigma = RELATIVE_WIDTH / cfg.num_bases
-    end = np.exp(-0.5 * SUPPORT**2)
-    return np.maximum(0.0, (np.exp(-0.5 * (distance / sigma) ** 2) - end) / (1 - end))
-
-
-def basis_offsets(
-    motion: Tensor,
-    time: float,
-    cfg: Config,
-    ops: ModelOps,
-    sink: list[RankOneGradient | UnstoredGradient] | None = None,
-) -> Offsets:
-    """Offsets at `time` of Gaussians with coefficients `motion`, differentiable in `motion`.
-
-    Args:
-        motion: (N, B, channels) coefficients; channels as in `motion_layout`, those of the centers in mm.
-        time: in [0, 1].
-        sink: takes the gradient of `motion` in place of `motion.grad`. The gradient of one time step is an outer
-            product, 30 times smaller than the coefficients, and the optimizer can use it in this form.
-    Raises:
-        ValueError: a wrong shape.
-    """
-    num_bases, channels = motion_shape(cfg)
-    check_shape(f"motion:N,{num_bases},{channels}", motion=motion)
-    total = _WeightedSum.apply(motion, basis_weights(time, cfg.deformation.basis), sink, ops)
-    widths = motion_widths(cfg)  # `split` has one gradient; slices have one each, of full size, to add up
-    parts = dict(zip(widths, total.split(list(widths.values()), 1), strict=True))
-    return Offsets.from_channels(parts, cfg.deformation)
-
-
 @dataclass(frozen=True)
 class RankOneGradient:
-    """Gradient of `motion` from one time step: the outer product of weights (B,) and v_offsets (N, channels)."""
+    """Gradient of temporal coefficients (N, B, C) from one time step: the outer product of two vectors.
 
+    It is 30 times smaller than the coefficients, and the optimizer uses it in this form.
+    """
+
+    name: str
+    """The tensor of the Gaussians that it is the gradient of."""
     weights: NDArray[np.float64]
+    """(B,) values of the basis functions at the time."""
     v_offsets: Tensor
+    """(N, C) gradient of the offsets at the time."""
 
 
 class UnstoredGradient(ABC):
@@ -270,40 +206,3 @@ class UnstoredGradient(ABC):
 
 Gradient = RankOneGradient | UnstoredGradient
 """What a time step leaves for the optimizer."""
-
-
-class _WeightedSum(torch.autograd.Function):
-    """sum_b weights[b] * motion[:, b]."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, motion: Tensor, weights: NDArray[np.float64], sink: list[Gradient] | None, ops: ModelOps
-    ) -> Tensor:
-        ctx.weights, ctx.sink, ctx.ops = weights, sink, ops
-        return ops.weighted_sum(motion.detach(), weights)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, None, None, None]:
-        if ctx.sink is not None:
-            ctx.sink.append(RankOneGradient(ctx.weights, v_out.contiguous()))
-            return None, None, None, None
-        return ctx.ops.weighted_sum_backward(v_out, ctx.weights), None, None, None
-
-
-def weighted_sum(motion: Tensor, weights: NDArray) -> Tensor:
-    """(N, C) sum_b weights[b] * motion[:, b] in PyTorch, on any device; `basis_numba.py` computes the same.
-
-    Args:
-        motion: (N, B, C) coefficients. weights: (B,) values of the basis functions.
-    """
-    return torch.matmul(_like(weights, motion), motion)
-
-
-def weighted_sum_backward(v_out: Tensor, weights: NDArray) -> Tensor:
-    """(N, B, C) gradient of `motion`, given that of the sum, (N, C)."""
-    return v_out[:, None] * _like(weights, v_out)[:, None]
-
-
-def _like(weights: NDArray, values: Tensor) -> Tensor:
-    return torch.as_tensor(weights).to(values.device, values.dtype, non_blocking=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from . import basis_numba, hexplane, hexplane_numba, motion
+from . import basis, basis_numba, hexplane, hexplane_numba
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class ModelOps:
 
     name: str
     weighted_sum: Callable[..., Tensor]
-    """Offsets from temporal coefficients: see `motion.weighted_sum`."""
+    """Offsets from temporal coefficients: see `basis.weighted_sum`."""
     weighted_sum_backward: Callable[..., Tensor]
-    """Its gradient: see `motion.weighted_sum_backward`."""
+    """Its gradient: see `basis.weighted_sum_backward`."""
     hexplane_linear: Callable[..., tuple[Tensor, ...]]
     """A linear layer on HexPlane features: see `hexplane.hexplane_linear`."""
     fuse_heads: bool
@@ -38,8 +38,8 @@ NUMBA = ModelOps(
 )
 TORCH = ModelOps(
     "torch",
-    motion.weighted_sum,
-    motion.weighted_sum_backward,
+    basis.weighted_sum,
+    basis.weighted_sum_backward,
     hexplane.hexplane_linear,
     fuse_heads=True,
 )

@@ -125,8 +125,8 @@ def apply_plan(
     rows = rows[torch.from_numpy(morton_order(means.cpu().numpy())).to(rows.device)]
     for name, value in tensors.items():
         tensors[name] = torch.cat([value.detach(), added[name]])[rows].requires_grad_()
-        state = optimizer.states[name]
-        state.first, state.second = (_with_zeros(m, rows) for m in (state.first, state.second))
+        if state := optimizer.states.get(name):  # none of what no gradient trains
+            state.first, state.second = (_with_zeros(m, rows) for m in (state.first, state.second))
     grown = DensityStats(*(_with_zeros(value, rows) for value in stats.tensors().values()))
     for cleared in (grown.grad2d_ndc_sum, grown.num_seen):
         cleared.zero_()

@@ -73,9 +73,13 @@ class GaussianMethod(Method):
         """Learning rate of a tensor of the Gaussians, of a parameter of the field or of its planes."""
         return rate_of(name, cfg, spatial_scale)
 
-    def position(self, _seed: int, stage: Stage, _iteration: int, num_frames: int, rng: np.random.Generator) -> int:
+    def position(self, cfg: Config, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
         """The training frame of an iteration; a pure function of its arguments. `rng` belongs to the iteration."""
-        return int(rng.integers(num_frames)) if stage is Stage.FINE else 0
+        if stage is not Stage.FINE:
+            return 0
+        if cfg.schedule.literal:
+            return int(rng.integers(num_frames))
+        return in_epochs(cfg.seed, stage, iteration, num_frames)
 
     def context(self, frames: TrainingFrames, cfg: Config) -> Any:
         """What the loss needs of all training frames, made once: `Drawn.context`."""

@@ -21,7 +21,8 @@ from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.shell import command
 from ..data import FrameSequence
-from ..model.gaussians import Gaussians, create_gaussians, motion_layout
+from ..model.basis import spline_weights
+from ..model.gaussians import Gaussians, create_gaussians
 from ..model.hexplane import plane_shapes
 from ..model.method import method_of
 from ..model.motion import Field, Motion
@@ -35,7 +36,7 @@ from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
-from .optimizer import Optimizer
+from .optimizer import GIVEN, TEMPORAL, Optimizer
 from .photometric import ClearedFrames, smoke_of
 from .step import TrainingStep
 from .tracks import StartTracks
@@ -88,9 +89,10 @@ def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, Arra
     model = motion.schema(cfg)
     trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
     trained |= {name: ArraySpec("float32", shape) for name, shape in motion.parameter_shapes(cfg).items()}
+    trained = {name: spec for name, spec in trained.items() if name not in GIVEN}
     optimizer = {f"{name}.{moment}": spec for name, spec in trained.items() for moment in ("first", "second")}
     for name, spec in trained.items():
-        optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name == "motion" else 1,))
+        optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name in TEMPORAL else 1,))
     planes = motion.planes(cfg)
     if planes is not None:
         moments = ArraySpec("float32", ("K", planes.channels))
@@ -102,8 +104,8 @@ def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, Arra
     found |= {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
     found |= {"left_out": ArraySpec("float32", ("F", VISITS))} if doubts else {}
     if cfg.loss.track_weight and cfg.init.motion == "flow":
-        found["tracks.coefficients"] = ArraySpec("float32", ("P", cfg.deformation.basis.num_bases, 3))
-        found |= {"tracks.followed": ArraySpec("float32", ("P", "F")), "tracks.rows": ArraySpec("int64", ("N",))}
+        found["tracks.displacement"] = ArraySpec("float32", ("F", "P", 3))
+        found |= {"tracks.followed": ArraySpec("float32", ("F", "P")), "tracks.rows": ArraySpec("int64", ("N",))}
     return model | found
 
 
@@ -172,11 +174,18 @@ class GaussianTrainer(Trainer):
         cloud, motion, tracks = first.cloud, first.motion, None
         gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
         if motion is not None:
-            coefficients = torch.from_numpy(motion.coefficients)
-            gaussians["motion"].detach()[..., motion_layout(cfg)["means"]] = coefficients
+            trained = self.step_once.frames.indices
+            gaussians["motion"].detach()[:] = torch.from_numpy(motion.coefficients)
+            gaussians["frame_motion"].detach()[:, trained] = torch.from_numpy(motion.at_frames)
             if cfg.loss.track_weight:
-                followed = torch.from_numpy(motion.followed).float()
-                tracks = StartTracks(coefficients, followed, torch.arange(len(coefficients))).to(self.device)
+                num_bases = cfg.deformation.basis.num_bases
+                weights = [spline_weights(frame.time, num_bases) for frame in frames]
+                displacement = [motion.displacement(each, position) for position, each in enumerate(weights)]
+                tracks = StartTracks(
+                    torch.from_numpy(np.stack(displacement).astype(np.float32)),
+                    torch.from_numpy(np.ascontiguousarray(motion.followed.T, np.float32)),
+                    torch.arange(len(motion.coefficients)),
+                ).to(self.device)
         field = self.motion.field(gaussians["means"].detach(), cfg)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
         shares = torch.zeros(len(self.sequence.indices("train")), VISITS) if self.step_once.doubt else None

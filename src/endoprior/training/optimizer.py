@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.config import Config, OptimConfig
-from ..model.gaussians import ATTRIBUTES, Gaussians, motion_widths
-from ..model.motion import Field, UnstoredGradient
+from ..model.gaussians import ATTRIBUTES, Gaussians, change_layout
+from ..model.motion import Field, RankOneGradient, UnstoredGradient
 from ..system.arrays_file import part
 from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import LARGEST_GRADIENT
@@ -37,6 +37,10 @@ BASIS_DECAY = 0.1  # share of the rates of temporal coefficients left at `decay_
 EPSILON, BASIS_EPSILON = 1e-15, 1e-7
 """Adam's epsilon, and that for temporal coefficients and gloss: else the faint gradient that leaks to what tools hide
 would move it as fast as any other."""
+TEMPORAL = ("motion", "changes")
+"""Tensors of temporal coefficients, which Adam steps by outer products, only functions with a weight."""
+GIVEN = ("frame_motion",)
+"""Tensors of Gaussians that no gradient trains."""
 LATE = 0.75  # share of `decay_iterations` after which the rates without a final value begin to fall
 
 
@@ -66,12 +70,14 @@ def rate_of(name: str, cfg: Config, spatial_scale: float) -> Rate:
     return lambda iteration: spatial_scale * log_linear(start, FINAL_SHARE * start, iteration, optim.decay_iterations)
 
 
-def motion_rates(cfg: Config, iteration: int) -> NDArray:
-    """(C,) learning rate of each channel of the temporal coefficients."""
+def temporal_rates(name: str, cfg: Config, iteration: int) -> NDArray:
+    """(C,) learning rate of each channel of `motion` or of `changes`."""
     decay = log_linear(1.0, BASIS_DECAY, iteration, cfg.optim.decay_iterations)
-    own = {"opacity_logits": BASIS_OPACITY_LR}
-    widths = motion_widths(cfg)
-    return np.concatenate([np.full(width, own.get(name, cfg.optim.basis_lr) * decay) for name, width in widths.items()])
+    if name == "motion":
+        return np.full(3, cfg.optim.basis_lr * decay)
+    layout, own = change_layout(cfg), {"opacity_logits": BASIS_OPACITY_LR}
+    rates = [np.full(part.stop - part.start, own.get(each, cfg.optim.basis_lr)) for each, part in layout.items()]
+    return np.concatenate(rates) * decay
 
 
 class Optimizer:
@@ -83,8 +89,9 @@ class Optimizer:
         self.gaussians, self.field, self.cfg, self._ops = gaussians, field, cfg, ops
         self.states = {name: AdamState(param) for name, param in self._dense().items()}
         self.rates = {name: rate_of(name) for name in self.states}
-        if "motion" in gaussians.tensors:
-            self.states["motion"] = AdamState(gaussians["motion"], gaussians["motion"].shape[1])
+        for name in TEMPORAL:
+            if name in gaussians.tensors:
+                self.states[name] = AdamState(gaussians[name], gaussians[name].shape[1])
         self.planes = PlaneAdam(field.grid, EPSILON) if field and field.grid else None
         if self.planes:
             self.rates[PLANES] = rate_of(PLANES)
@@ -115,9 +122,11 @@ class Optimizer:
             names = unstored[0].names
             states, params = [self.states[name] for name in names], [gaussians[name] for name in names]
             adam_unstored_step(states, params, unstored, self.rates[names[0]](iteration), EPSILON)
-        else:
-            state, rates = self.states["motion"], motion_rates(self.cfg, iteration)
-            self._ops.adam_basis_step(state, gaussians["motion"], gradients, rates, BASIS_EPSILON, skip)
+            return
+        for name in TEMPORAL:
+            if own := [each for each in gradients if isinstance(each, RankOneGradient) and each.name == name]:
+                rates = temporal_rates(name, self.cfg, iteration)
+                self._ops.adam_basis_step(self.states[name], gaussians[name], own, rates, BASIS_EPSILON, skip)
 
     def count_unusable(self) -> dict[str, int | Tensor]:
         """How many entries of each gradient are not finite or too large to be squared, by name."""
@@ -148,7 +157,7 @@ class Optimizer:
 
     def _dense(self) -> dict[str, Tensor]:
         """Parameters whose gradient autograd writes to `.grad`, by name."""
-        found = {name: value for name, value in self.gaussians.tensors.items() if name != "motion"}
+        found = {name: value for name, value in self.gaussians.tensors.items() if name not in (*TEMPORAL, *GIVEN)}
         return found | (self.field.parameters if self.field else {})
 
     def _clear_dense(self) -> None:

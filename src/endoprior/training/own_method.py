@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from ..core.config import Config
+from ..model.basis import BasisMotion
 from ..model.hexplane_field import HexPlaneMotion
-from ..model.motion import BasisMotion, Motion
+from ..model.motion import Motion
 from .gaussian_method import GaussianMethod
 
 MOTIONS: dict[str, Motion] = {"hexplane": HexPlaneMotion(), "basis": BasisMotion()}

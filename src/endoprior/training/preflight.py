@@ -20,6 +20,7 @@ from ..model.method import method_of
 from ..model.presets import preset, preset_names
 from ..system.memory import available_bytes
 from .gaussian_method import GaussianMethod
+from .optimizer import GIVEN
 
 
 def reject_ignored_options(cfg: Config) -> None:
@@ -85,7 +86,8 @@ def least_bytes(cfg: Config, num: int, num_train: int, width: int, height: int) 
     }
     gaussians = [size for name, size in sizes.items() if name.startswith("gaussians.")]
     fields = [size for name, size in sizes.items() if name.startswith("field.")]
-    state = (1 + MOMENTS) * sum(gaussians + fields)
+    given = sum(sizes.get(f"gaussians.{name}", 0) for name in GIVEN)  # has no moments
+    state = (1 + MOMENTS) * sum(gaussians + fields) - MOMENTS * given
     # Growing and pruning copy a tensor twice; tracks are there before the moments are.
     growing, motion = 2 * max(gaussians, default=0), sizes.get("gaussians.motion", 0)
     tracks = TRACK_BYTES * num_train * num + motion if cfg.init.motion == "flow" and motion else 0

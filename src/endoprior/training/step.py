@@ -143,7 +143,7 @@ class TrainingStep:
             rng: that of the iteration, from which the splits of density control are drawn later.
         """
         cfg, iteration, fine = self.cfg, state.iteration + 1, state.stage is Stage.FINE
-        position = self.method.position(cfg.seed, state.stage, iteration, len(self.frames), rng)
+        position = self.method.position(cfg, state.stage, iteration, len(self.frames), rng)
         is_right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
         half = fine and iteration <= cfg.schedule.half_resolution_iterations
         frame = self.frames.frame(position, half=half, right=is_right)
@@ -207,8 +207,8 @@ class TrainingStep:
         is_error = self.method.color_is_error
         error = terms["color"] if is_error else color_l1(drawn.out.color.detach(), frame.rgb, frame.tissue_mask)
         if drawn.offsets is not None and state.tracks is not None:
-            means, basis = drawn.gaussians["means"], cfg.deformation.basis
-            term = self.ops.track_term(means, drawn.offsets.means, state.tracks, frame, drawn.position, basis)
+            means, moved = drawn.gaussians["means"], drawn.offsets.means
+            term = self.ops.track_term(means, moved, state.tracks, frame, drawn.position)
             terms |= {"track": cfg.loss.track_weight * term}
         if drawn.before is not None:
             terms |= temporal_terms(drawn, drawn.before, self.motion, state.stats, cfg, self.ops)

@@ -2,7 +2,7 @@
 
 A Gaussian stays on the track that optical flow gave it, wherever flow really saw it. Color alone cannot tell which
 point of flat tissue went where: without this term, training lets tissue slide.
-`N` Gaussians, `P` tracks, `B` basis functions, `T` training frames.
+`N` Gaussians, `P` tracks, `T` training frames.
 """
 
 # pyright: reportCallIssue=false
@@ -17,25 +17,21 @@ from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..compute.simd import LANES, prefetch
-from ..core.config_deformation import BasisConfig
 from ..core.types import Camera
-from ..model.motion import basis_weights, weighted_sum
 from .frames import TrainingFrame
 
 REFERENCE_WIDTH_PX = 640
 """Errors are in px of an image of this width, so that the weight of the term does not depend on the image size."""
 HUBER_PX = 1.0  # errors beyond this count linearly: a track may be wrong
 CHUNK = 1024  # Gaussians per task
-AHEAD = 8  # Gaussians between asking for the track of one and reading it
 
 
 @dataclass(frozen=True)
 class StartTracks:
     """The tracks that the first Gaussians started on."""
 
-    coefficients: Tensor  # (P, B, 3) motion from the point's source frame, mm
-    followed: Tensor  # (P, T) float, 1 where the flow found the point in a training frame and returned to it, else 0
+    displacement: Tensor  # (T, P, 3) of the point from its source frame in each training frame, mm
+    followed: Tensor  # (T, P) float, 1 where the flow found the point in a training frame and returned to it, else 0
     rows: Tensor  # (N,) int64 track of each Gaussian: its own, or that of the first Gaussian it descends from
 
     def inherited(self, parents: Tensor) -> StartTracks:
@@ -51,14 +47,7 @@ class StartTracks:
         return dict(vars(self))
 
 
-def track_term(
-    means: Tensor,
-    offsets: Tensor,
-    tracks: StartTracks,
-    frame: TrainingFrame,
-    position: int,
-    cfg: BasisConfig,
-) -> Tensor:
+def track_term(means: Tensor, offsets: Tensor, tracks: StartTracks, frame: TrainingFrame, position: int) -> Tensor:
     """Mean over the Gaussians of w h(e), times the frame's reliability, (): e is the distance to the track, h the
     pseudo-Huber penalty, w `followed`.
 
@@ -66,10 +55,10 @@ def track_term(
         means: (N, 3) canonical centers, mm. offsets: (N, 3) their displacement at the frame, mm; gets the gradient.
         position: of the frame among the training frames.
     """
-    wanted = weighted_sum(tracks.coefficients, basis_weights(frame.time, cfg))[tracks.rows]
+    wanted = tracks.displacement[position, tracks.rows]
     error_px = (offsets - wanted) * _px_per_mm(means.detach() + wanted, frame.camera)[:, None]
     penalty = HUBER_PX * (torch.sqrt((error_px**2).sum(1) + HUBER_PX**2) - HUBER_PX)
-    return frame.reliability * (tracks.followed[tracks.rows, position] * penalty).mean()
+    return frame.reliability * (tracks.followed[position, tracks.rows] * penalty).mean()
 
 
 def _px_per_mm(points: Tensor, camera: Camera) -> Tensor:
@@ -81,26 +70,26 @@ def _px_per_mm(points: Tensor, camera: Camera) -> Tensor:
 
 
 def track_term_numba(
-    means: Tensor, offsets: Tensor, tracks: StartTracks, frame: TrainingFrame, position: int, cfg: BasisConfig
+    means: Tensor, offsets: Tensor, tracks: StartTracks, frame: TrainingFrame, position: int
 ) -> Tensor:
     """See `track_term`."""
-    return _TrackTerm.apply(offsets, means.detach(), tracks, frame, position, cfg)
+    return _TrackTerm.apply(offsets, means.detach(), tracks, frame, position)
 
 
 class _TrackTerm(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, offsets: Tensor, means: Tensor, tracks: StartTracks, frame: TrainingFrame, *where) -> Tensor:
-        position, cfg = where
-        weights, camera = basis_weights(frame.time, cfg), frame.camera
-        support = np.flatnonzero(weights)
+    def forward(
+        ctx: Any, offsets: Tensor, means: Tensor, tracks: StartTracks, frame: TrainingFrame, position: int
+    ) -> Tensor:
+        camera = frame.camera
         scale = camera.fx * REFERENCE_WIDTH_PX / camera.width
-        moved, coefficients = offsets.detach().contiguous().numpy(), tracks.coefficients.numpy()
-        followed = np.ascontiguousarray(tracks.followed.numpy()[:, position])
+        moved = offsets.detach().contiguous().numpy()
+        displacement, followed = tracks.displacement.numpy()[position], tracks.followed.numpy()[position]
         v_offsets, sums = np.empty_like(moved), np.zeros((len(moved) + CHUNK - 1) // CHUNK)
         _track_kernel(
-            means.numpy(), moved, coefficients, followed, tracks.rows.numpy(),
-            weights.astype(np.float32), support[0], support[-1] + 1, camera.world_to_camera[2].astype(np.float32),
-            np.float32(scale), np.float32(frame.reliability / len(moved)), v_offsets, sums,
+            means.numpy(), moved, displacement, followed, tracks.rows.numpy(),
+            camera.world_to_camera[2].astype(np.float32), np.float32(scale),
+            np.float32(frame.reliability / len(moved)), v_offsets, sums,
         )  # fmt: skip
         ctx.v_offsets = torch.from_numpy(v_offsets)
         return offsets.new_tensor(sums.sum() * frame.reliability / len(moved))
@@ -108,45 +97,29 @@ class _TrackTerm(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_term: Tensor) -> tuple[Tensor | None, ...]:
-        return v_term * ctx.v_offsets, None, None, None, None, None
-
-
-@njit(inline="always")
-def _wanted(coefficients, weights, first, stop, wanted, mean, view_z):
-    # Writes where one track, (B, 3), wants its Gaussian to be moved, and returns the camera z there.
-    wanted[:] = 0
-    for b in range(first, stop):
-        for c in range(3):
-            wanted[c] += weights[b] * coefficients[b, c]
-    z = view_z[3]
-    for c in range(3):
-        z += view_z[c] * (mean[c] + wanted[c])
-    return z
+        return v_term * ctx.v_offsets, None, None, None, None
 
 
 @njit(parallel=True, cache=True)
-def _track_kernel(
-    means, offsets, coefficients, followed, rows, weights, first, stop, view_z, scale, share, v_offsets, sums
-):
+def _track_kernel(means, offsets, displacement, followed, rows, view_z, scale, share, v_offsets, sums):
     # One task per CHUNK Gaussians: writes v_offsets (N, 3), `share` times the gradient, and one sum of penalties.
-    # `weights` (B,) count from `first` to `stop`; `view_z` (4,) turns a point into its camera z.
+    # displacement (P, 3) and followed (P,) are those of the frame; `view_z` (4,) turns a point into its camera z.
     one, huber = np.float32(1), np.float32(HUBER_PX)
-    flat, stride = coefficients.reshape(-1), 3 * coefficients.shape[1]
     for task in prange(len(sums)):
-        wanted, error = np.empty(3, np.float32), np.empty(3, np.float32)
+        error = np.empty(3, np.float32)
         for n in range(task * CHUNK, min((task + 1) * CHUNK, len(means))):
-            row, ahead = rows[n], rows[min(n + AHEAD, len(rows) - 1)] * stride
-            for i in range(3 * first, 3 * stop + LANES, LANES):
-                prefetch(flat, ahead + i)
+            row = rows[n]
             v_offsets[n, :] = 0
             if followed[row] == 0:
                 continue
-            z = _wanted(coefficients[row], weights, first, stop, wanted, means[n], view_z)
+            z = view_z[3]
+            for c in range(3):
+                z += view_z[c] * (means[n, c] + displacement[row, c])
             if z <= 0:
                 continue
             px_per_mm, squared = scale / max(z, np.float32(1e-6)), np.float32(0)
             for c in range(3):
-                error[c] = (offsets[n, c] - wanted[c]) * px_per_mm / huber
+                error[c] = (offsets[n, c] - displacement[row, c]) * px_per_mm / huber
                 squared += error[c] * error[c]
             root = np.sqrt(squared + one)
             sums[task] += followed[row] * huber * huber * (root - one)
