@@ -218,7 +218,7 @@ def test_a_sequence_folder_is_trained_without_preparing_it_again(video, tmp_path
     job, done = Run.from_words([str(data), str(tmp_path / "out"), "--seed", "3"]).job(print), []
     assert type(job) is SequenceJob and job.data == data and job.cfg.seed == 3
 
-    def step_done(step, job, _progress):
+    def step_done(step, job, _progress, _handed_on):
         done.append(step.name)
         write_json(job.findings, {"findings": []})
 

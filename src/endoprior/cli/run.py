@@ -64,7 +64,17 @@ class Run(Command):
 
     def execute(self) -> int | None:
         """Do every step, with one progress display."""
-        from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of, verdict_of
+        from ..pipeline import (
+            HandedOn,
+            Job,
+            notes_of,
+            open_folder,
+            problems,
+            removed_if_rejected,
+            run_step,
+            steps_of,
+            verdict_of,
+        )  # fmt: skip
         from ..runs import kernel_cache
         from ..runs.log import missed_tools_line
 
@@ -79,12 +89,13 @@ class Run(Command):
         if resumes:
             say(resume_words(names, [step.name for step in waiting]))
         kernel_cache.fill(job.cfg, say)
+        handed_on = HandedOn()
         try:
             with removed_if_rejected(job):
                 for step in steps:
                     if step in waiting:
                         with step_progress(names, step.name) as progress:
-                            lines = run_step(step, job, progress)
+                            lines = run_step(step, job, progress, handed_on)
                     else:
                         say(f"{step_head(names, step.name):<13} done before")
                         lines = notes_of(step, job)

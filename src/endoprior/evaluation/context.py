@@ -101,7 +101,7 @@ class RenderedFrames:
     """Rendered frames by index: each is rendered when first asked for, and kept as memory allows."""
 
     def __init__(self, reconstruction: Reconstruction, sequence: FrameSequence, split: Split) -> None:
-        self._reconstruction, self._sequence = reconstruction, sequence
+        self._reconstruction, self.sequence = reconstruction, sequence
         self._scored = set(sequence.indices(split))
         self._cache: BoundedCache[RenderedFrame] = BoundedCache(cache_bytes(), lambda rendered: rendered.nbytes)
 
@@ -110,7 +110,7 @@ class RenderedFrames:
 
     def _render(self, index: int) -> RenderedFrame:
         color, depth = self._reconstruction.render(index)
-        camera, problem = self._sequence.camera(index), ""
+        camera, problem = self.sequence.camera(index), ""
         size = camera.height, camera.width
         for name, array, shape in (("depth", depth, size), ("color", color, (*size, 3))):
             if array is not None and (array.shape != shape or array.dtype != np.float32):
@@ -139,6 +139,8 @@ class Evaluation:
     """How good the model is, in a word, with its reasons."""
     protocols: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By name of another paper's protocol: its `tags`, `scores` and `skipped`; see `protocols.score_protocols`."""
+    rendered: RenderedFrames | None = field(default=None, repr=False)
+    """The frames that were rendered to be scored, to show them without rendering them again."""
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """Record a score, or `reason` where it is not finite; an int stays one."""

@@ -77,6 +77,7 @@ def evaluate(
                 if name in SCORERS or isinstance(error, ScoreUnavailable):
                     raise
                 raise ScoreUnavailable(REGISTRY.failure(name, error)) from error
+    result.rendered = context.rendered
     result.protocol["tags"] = tags_of(OURS, context, sequence.indices(split), sequence.mask_folder, reading.shrink)
     result.protocols = score_protocols(protocols, context, scored_data(reading))
     return result

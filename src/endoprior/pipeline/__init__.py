@@ -1,6 +1,7 @@
 """From a video to a scene, its scores, a video and a player: all steps of the program in one call, for one or many."""
 
 from .batch import SUMMARY, TABLE, Entry, Outcome, run_here, run_on, write_summary
+from .handed_on import HandedOn
 from .job import Job, SequenceJob, make_job, open_folder, removed_if_rejected
 from .steps import STEPS, Step, notes_of, problems, run_step, steps_of, verdict_of
 
@@ -9,6 +10,7 @@ __all__ = [
     "SUMMARY",
     "TABLE",
     "Entry",
+    "HandedOn",
     "Job",
     "Outcome",
     "SequenceJob",
