@@ -190,7 +190,7 @@ def test_a_job_whose_inputs_have_changed_does_not_take_the_folder(video, tmp_pat
 
 def test_a_rejected_run_leaves_nothing(video, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
-    monkeypatch.setattr("endoprior.runs.kernel_cache.fill", lambda *_: None)
+    monkeypatch.setattr("endoprior.runs.kernel_cache.is_filled", lambda _cfg: True)
     assert main(["run", str(video), str(out), "--calibration", str(tmp_path / "absent.yaml")]) == 2
     assert "absent.yaml" in capsys.readouterr().err and not out.exists()
 
@@ -222,7 +222,7 @@ def test_a_sequence_folder_is_trained_without_preparing_it_again(video, tmp_path
         done.append(step.name)
         write_json(job.findings, {"findings": []})
 
-    monkeypatch.setattr("endoprior.runs.kernel_cache.fill", lambda *_: None)
+    monkeypatch.setattr("endoprior.runs.kernel_cache.is_filled", lambda _cfg: True)
     monkeypatch.setattr("endoprior.pipeline.run_step", step_done)
     assert main(["run", str(data), str(tmp_path / "out")]) == 0
     assert done == [step.name for step in STEPS[1:]] and f"{data}: a sequence folder" in capsys.readouterr().out

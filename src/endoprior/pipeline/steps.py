@@ -40,6 +40,7 @@ from ..runs.report import write_report
 from ..runs.train import TrainingRun, WindowedRun, start_run
 from ..system.atomic import write_json
 from ..system.parallel import Pool, frame_threads
+from ..training.trainer import StepReport, Trainer
 from ..visualization.image_tools import colorize, label, tile
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
@@ -161,7 +162,16 @@ def demand_known_motion(job: Job, sequence: FrameSequence, unexplained: list[int
 def _train(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
     run, notes = start_training(job, handed_on.sequence)
     handed_on.sequence = None  # the run has it, and what it decoded
-    scene = run.complete(lambda _report, trainer: progress("training", *trainer.progress()))
+    num_windows, before, last = len(run.waiting(job.run)) if isinstance(run, WindowedRun) else 1, 0, 0
+
+    def observer(_report: StepReport, trainer: Trainer) -> None:
+        nonlocal before, last
+        done, total = trainer.progress()
+        before, last = before + (total if done < last else 0), done
+        progress("training", before + done, max(num_windows * total, before + total))
+
+    progress("starting", 0, 0)
+    scene = run.complete(observer)
     return [*notes, f"{len(_of_gaussians(scene)):,} Gaussians"]
 
 
