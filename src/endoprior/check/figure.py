@@ -67,7 +67,7 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     if unsure:
         _draw_unsure(rest[0], [sequence.frame(i) for i in unsure], facts)
     with whole_file(path) as temporary:
-        figure.savefig(temporary)
+        figure.savefig(temporary, pil_kwargs={"compress_level": 1})
 
 
 def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:

@@ -95,7 +95,8 @@ def _prepare(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[
     assert isinstance(job, Job), "a sequence folder is prepared"
     done = prepare(job.source, job.data, job.prepare, progress, handed_on.facts)
     if job.choice:
-        draw_scan(job.source, job.choice.scanned, (job.out / SCAN).with_suffix(".png"), job.prepare.folder_rate)
+        choice, figure = job.choice, (job.out / SCAN).with_suffix(".png")
+        draw_scan(job.source, choice.scanned, figure, job.prepare.folder_rate, choice.pictures)
     return [f"{done.num_frames} frames of {done.size[0]}x{done.size[1]}", *(f"note: {note}" for note in done.notes)]
 
 

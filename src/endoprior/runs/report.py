@@ -61,7 +61,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     _plot_psnr(psnr_axis, per_frame)
     _write_scores(table_axis, metrics, sequence.depth_is_relative)
     with whole_file(path) as temporary:
-        figure.savefig(temporary)
+        figure.savefig(temporary, pil_kwargs={"compress_level": 1})
 
 
 def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
