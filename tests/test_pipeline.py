@@ -18,11 +18,23 @@ from endoprior.cli.run import Run, resume_words
 from endoprior.core.checks import InputError, quotation
 from endoprior.core.shell import command
 from endoprior.data import load_sequence
+from endoprior.data.files import read_json
 from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.pipeline import STEPS, SequenceJob, make_job, notes_of, open_folder, problems, run_step, verdict_of
+from endoprior.pipeline import (
+    STEPS,
+    HandedOn,
+    SequenceJob,
+    make_job,
+    notes_of,
+    open_folder,
+    problems,
+    run_step,
+    verdict_of,
+)
 from endoprior.pipeline.steps import PREVIEW_TITLE, demand_known_motion
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.work_folder import work_lock
@@ -138,6 +150,31 @@ def test_an_interrupted_training_resumes_bit_identically(video, done, tmp_path):
     for step in STEPS[:3]:
         run_step(step, job, quiet)
     assert (job.run / "scene.safetensors").read_bytes() == (done.run / "scene.safetensors").read_bytes()
+
+
+@pytest.mark.slow
+def test_what_steps_hand_on_changes_no_result(video, done, tmp_path, monkeypatch):
+    job, handed_on, rendered = job_of(video, tmp_path / "out"), HandedOn(), []
+    open_folder(job)
+    for step in STEPS:
+        if step.name == "video":
+            assert handed_on.rendered is not None
+            monkeypatch.setattr(SingleScene, "filmed", lambda *_: rendered.append(1))
+        if step.name == "player":
+            monkeypatch.undo()
+        run_step(step, job, quiet, handed_on)
+    assert not rendered and handed_on.sequence is handed_on.rendered is None
+
+    def files(folder):
+        return {file.relative_to(folder): file.read_bytes() for file in sorted(folder.rglob("*.png"))}
+
+    assert files(job.data) == files(done.data)
+    assert (job.run / "scene.safetensors").read_bytes() == (done.run / "scene.safetensors").read_bytes()
+    timed = {"fps", "fps_cached", "train_seconds", "iterations_per_second"}
+    ours, theirs = (read_json(each.run / "metrics.json")["scores"] for each in (job, done))
+    assert {name: ours[name] for name in ours.keys() - timed} == {name: theirs[name] for name in theirs.keys() - timed}
+    facts = [read_json(each.findings)["facts"] for each in (job, done)]
+    assert all(facts[0][name] == facts[1][name] for name in ("changes", "motion", "windows"))
 
 
 def test_a_resumed_job_says_so_and_repeats_the_notes(said):
