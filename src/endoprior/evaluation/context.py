@@ -25,6 +25,7 @@ OUTLIER_DB = 3.0  # A frame whose PSNR lies this far below the median of its spl
 EXACT = "infinite: the rendered frames equal the true ones exactly"
 """Why there is no PSNR where no frame has any error; black frames, for example."""
 NETWORKS_OFF = "network scores were not asked for"
+SPEED_OFF = "the speed of rendering was not asked for"
 NO_SCENE = "needs a scene; there are rendered images only"
 TOO_SLOW = "needs other frames of the video, which a radiance field renders for hours on a CPU"
 NO_GAUSSIANS = "needs the Gaussians of a scene; this one has none"
@@ -182,6 +183,8 @@ class EvaluationContext:
     """Where scores go; `add`, `add_mean`, `add_frames` and `skip` write to it."""
     given_path: NDArray[np.float64] | None = None
     """(T, 4, 4) camera-to-world, mm: stands in for the true path where there is none."""
+    speed: bool = True
+    """Whether to time the rendering, which takes a second or more."""
 
     @cached_property
     def true_path(self) -> NDArray[np.float64] | None:

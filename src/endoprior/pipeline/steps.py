@@ -185,7 +185,7 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     progress("rendering held-out frames", 0, 0)
     scene = _of_gaussians(load_scene(job.run))
     sequence = _frames_of(job, scene.config)
-    result = evaluate(scene, sequence, networks=False)
+    result = evaluate(scene, sequence, networks=False, speed=not job.is_preview)
     handed_on.rendered = result.rendered
     result.protocol |= mask_facts(job.run)
     missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
