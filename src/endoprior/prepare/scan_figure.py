@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from ..system.atomic import whole_file
+from ..visualization.figures import save_figure
 from .scan import PICTURES
 from .segments import WORDS, best_segment, from_json, segments_of
 from .source import open_source
@@ -79,5 +79,4 @@ def draw_scan(
     motion.set_ylabel("motion, % of width")
     motion.set_xlabel("s (no point: motion unknown)")
     motion.set_xlim(0, max(whole, 1e-3))
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, pil_kwargs={"compress_level": 1})
+    save_figure(figure, path)
