@@ -46,7 +46,7 @@ class Run(Command):
     out: Path = field(metadata={"place": "OUT"})
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
-    """A first look in a minute or two: at most 60 frames, 320 px wide. Not for scores."""
+    """A first look in less than a minute on two cores: at most 60 frames, 320 px wide. Not for scores."""
     segment: int = 0
     """Segment of `endoprior scan` to use, from 1; 0 is the best one. --start or --end choose any part."""
     all_segments: bool = False
