@@ -31,13 +31,13 @@ def fake_steps(monkeypatch):
     """Two steps that write a file; the second fails with what `fails` has under the name of the job."""
     fails: dict[str, Exception] = {}
 
-    def act(job, progress):
+    def act(job, _progress, _handed_on):
         if job.out.name in fails:
             raise fails[job.out.name]
         (job.run / "metrics.json").write_text(METRICS)
         return []
 
-    def first(job, progress):
+    def first(job, _progress, _handed_on):
         job.run.mkdir(parents=True)
         return []
 

@@ -116,7 +116,8 @@ def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
 def test_training_frames_and_depth_by_alpha_are_scored_beside(phantom):
     scene = still_scene(phantom)
     found = evaluate(scene, phantom, networks=False).scores
-    trained = evaluate(scene, phantom, "train", networks=False)
+    trained = evaluate(scene, phantom, "train", networks=False, speed=False)
+    assert found["fps"] > 0 and "fps" not in trained.scores and "not asked for" in trained.skipped["fps_cached"]
     assert len(phantom.indices("train")) <= 8 and found["psnr_train"] == trained.scores["psnr_tissue"]
     assert "psnr_train" in trained.skipped
     by_hand = []

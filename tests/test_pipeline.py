@@ -18,11 +18,23 @@ from endoprior.cli.run import Run, resume_words
 from endoprior.core.checks import InputError, quotation
 from endoprior.core.shell import command
 from endoprior.data import load_sequence
+from endoprior.data.files import read_json
 from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.pipeline import STEPS, SequenceJob, make_job, notes_of, open_folder, problems, run_step, verdict_of
+from endoprior.pipeline import (
+    STEPS,
+    HandedOn,
+    SequenceJob,
+    make_job,
+    notes_of,
+    open_folder,
+    problems,
+    run_step,
+    verdict_of,
+)
 from endoprior.pipeline.steps import PREVIEW_TITLE, demand_known_motion
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.work_folder import work_lock
@@ -140,6 +152,31 @@ def test_an_interrupted_training_resumes_bit_identically(video, done, tmp_path):
     assert (job.run / "scene.safetensors").read_bytes() == (done.run / "scene.safetensors").read_bytes()
 
 
+@pytest.mark.slow
+def test_what_steps_hand_on_changes_no_result(video, done, tmp_path, monkeypatch):
+    job, handed_on, rendered = job_of(video, tmp_path / "out"), HandedOn(), []
+    open_folder(job)
+    for step in STEPS:
+        if step.name == "video":
+            assert handed_on.rendered is not None
+            monkeypatch.setattr(SingleScene, "filmed", lambda *_: rendered.append(1))
+        if step.name == "player":
+            monkeypatch.undo()
+        run_step(step, job, quiet, handed_on)
+    assert not rendered and handed_on.sequence is handed_on.rendered is None
+
+    def files(folder):
+        return {file.relative_to(folder): file.read_bytes() for file in sorted(folder.rglob("*.png"))}
+
+    assert files(job.data) == files(done.data)
+    assert (job.run / "scene.safetensors").read_bytes() == (done.run / "scene.safetensors").read_bytes()
+    timed = {"fps", "fps_cached", "train_seconds", "iterations_per_second"}
+    ours, theirs = (read_json(each.run / "metrics.json")["scores"] for each in (job, done))
+    assert {name: ours[name] for name in ours.keys() - timed} == {name: theirs[name] for name in theirs.keys() - timed}
+    facts = [read_json(each.findings)["facts"] for each in (job, done)]
+    assert all(facts[0][name] == facts[1][name] for name in ("changes", "motion", "windows"))
+
+
 def test_a_resumed_job_says_so_and_repeats_the_notes(said):
     job, lines = said
     assert len(lines) > 3 and open_folder(job)
@@ -190,7 +227,7 @@ def test_a_job_whose_inputs_have_changed_does_not_take_the_folder(video, tmp_pat
 
 def test_a_rejected_run_leaves_nothing(video, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
-    monkeypatch.setattr("endoprior.runs.kernel_cache.fill", lambda *_: None)
+    monkeypatch.setattr("endoprior.runs.kernel_cache.is_filled", lambda _cfg: True)
     assert main(["run", str(video), str(out), "--calibration", str(tmp_path / "absent.yaml")]) == 2
     assert "absent.yaml" in capsys.readouterr().err and not out.exists()
 
@@ -218,11 +255,11 @@ def test_a_sequence_folder_is_trained_without_preparing_it_again(video, tmp_path
     job, done = Run.from_words([str(data), str(tmp_path / "out"), "--seed", "3"]).job(print), []
     assert type(job) is SequenceJob and job.data == data and job.cfg.seed == 3
 
-    def step_done(step, job, _progress):
+    def step_done(step, job, _progress, _handed_on):
         done.append(step.name)
         write_json(job.findings, {"findings": []})
 
-    monkeypatch.setattr("endoprior.runs.kernel_cache.fill", lambda *_: None)
+    monkeypatch.setattr("endoprior.runs.kernel_cache.is_filled", lambda _cfg: True)
     monkeypatch.setattr("endoprior.pipeline.run_step", step_done)
     assert main(["run", str(data), str(tmp_path / "out")]) == 0
     assert done == [step.name for step in STEPS[1:]] and f"{data}: a sequence folder" in capsys.readouterr().out

@@ -23,18 +23,22 @@ from ..data.found_tools import UNCERTAIN, read_rows
 from ..data.images import read_color
 from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
-from ..footage.camera_motion import CameraMotion, camera_motion
-from ..footage.changes import Changes, find_changes
+from ..footage.camera_motion import CameraMotion
+from ..footage.changes import Changes
+from ..footage.components import InOrder
+from ..footage.known_facts import KnownFacts
 from ..footage.overlays import find_static_overlays, without_strokes
 from ..footage.pose_fit import PoseFit, View, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
 from ..footage.units import FAR_MM, Polarity, UnitGuess, guess_unit, mask_polarity
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
+from ..system.parallel import Pool, frame_threads
 
 if TYPE_CHECKING:
     from ..initialization.sampling import PointCloud
 
+BYTES_PER_PX = 100  # memory in which a thread measures a frame, bytes for each px
 SAMPLES = 20  # evenly spaced frames for expensive measurements
 MOTION_FRAMES = 300  # largest number of frames for the camera motion
 CERTAIN = 0.5  # least certainty to report masks as inverted
@@ -164,16 +168,27 @@ class Facts:
         return float(2 * np.degrees(np.arctan(self.camera.width / 2 / self.camera.fx)))
 
 
-def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
-    """Measure a sequence that was opened with these options. Every frame is decoded and cached, as in training."""
-    cfg = cfg or DataConfig()
+def measure(sequence: FrameSequence, cfg: DataConfig | None = None, known: KnownFacts | None = None) -> Facts:
+    """Measure a sequence that was opened with these options. Every frame is decoded and cached, as in training.
+
+    Args:
+        known: facts of its frames that are known already.
+    """
+    cfg, known = cfg or DataConfig(), known or KnownFacts()
+    first = sequence.camera(0)
+    with frame_threads(BYTES_PER_PX * first.width * first.height) as pool:
+        return _measured(sequence, cfg, known, pool)
+
+
+def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool: Pool) -> Facts:
     count = len(sequence)
     frames = sequence.frames("video")
     samples = [sequence.frame(int(i)) for i in spread(count, SAMPLES)]
     images = [frame.rgb_u8 for frame in samples]
     polarity = mask_polarity([~frame.tissue_mask for frame in samples], images)
     outline = find_outline(without_strokes(images))
-    masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
+    decoded = pool.map(frames.__getitem__, range(count))  # and kept as memory allows
+    masked = masked_border(outline, images, (frame.tissue_mask for frame in decoded))
     view = max(int((~masked).sum()), 1)
     tool_fraction = np.array([1 - frame.tissue_mask.sum() / view for frame in frames])
     masks = MaskFacts(tool_fraction, polarity, _confidence(sequence))
@@ -196,11 +211,13 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         notes=tuple(sequence.remarks),
         camera_path_mm=distance,
         camera_turn_deg=turn,
-        motion=camera_motion([f.rgb_u8 for f in followed], [masks.tissue(f) for f in followed]),
+        motion=known.camera_motion(
+            lambda: (frame.rgb_u8 for frame in followed), lambda: map(masks.tissue, followed), pool.map
+        ),
         motion_step=step,
         windows=tuple(plan_windows(cameras, look_through(sequence), preset("default").windows.longest)),
-        pose_fit=_pose_fit(sequence),
-        changes=find_changes(frame.rgb_u8 for frame in frames),
+        pose_fit=_pose_fit(sequence, pool.map),
+        changes=known.find_changes(lambda: (frame.rgb_u8 for frame in frames), pool.map),
         masks=masks,
         border=_border(outline, images, tissue, masked),
         depth=_depth(sequence, samples, tissue, described, cfg),
@@ -305,7 +322,7 @@ def _depth(
     )
 
 
-def _pose_fit(sequence: FrameSequence) -> PoseFit | None:
+def _pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
     """Reproject depth between frames with the stored poses; None for a static camera or without enough corners."""
     first = sequence.camera(0)
 
@@ -316,7 +333,7 @@ def _pose_fit(sequence: FrameSequence) -> PoseFit | None:
     matrix = np.array([[first.fx, 0, first.cx - 0.5], [0, first.fy, first.cy - 0.5], [0, 0, 1]])
     stored = np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))])
     poses = np.linalg.inv(stored).astype(np.float64)
-    return measure_poses(view, matrix, poses, relative=sequence.depth_is_relative)
+    return measure_poses(view, matrix, poses, relative=sequence.depth_is_relative, each=each)
 
 
 def _stereo(sequence: FrameSequence) -> StereoFacts | None:

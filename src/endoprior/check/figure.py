@@ -22,7 +22,7 @@ from ..core.types import Frame
 from ..data import FrameSequence
 from ..footage.overlays import find_strokes
 from ..footage.units import FAR_MM, NEAR_MM
-from ..system.atomic import whole_file
+from ..visualization.figures import save_figure
 from ..visualization.image_tools import colorize
 from .facts import Facts
 from .findings import SEEN_AS_TISSUE, Finding
@@ -66,8 +66,7 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     _draw_findings(axes[2], facts, findings)
     if unsure:
         _draw_unsure(rest[0], [sequence.frame(i) for i in unsure], facts)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:

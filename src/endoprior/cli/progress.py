@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Self
 
@@ -16,12 +16,17 @@ UPDATE_SECONDS = 0.2
 """Time between two updates of the line on a terminal."""
 
 
-class Counting:
-    """Shows what is being done, how much of it is done, and the time that is left of it at this rate."""
+LeftOfAll = Callable[[str, int, int], float]
+"""Takes what is being done, how much of it, and of how much; gives the time that is left of the whole command, s."""
 
-    def __init__(self, head: str = "") -> None:
-        """Args: head: stands in front of each line."""
+
+class Counting:
+    """Shows what is being done, how much of it is done, and the time that is left."""
+
+    def __init__(self, head: str = "", left_of_all: LeftOfAll | None = None) -> None:
+        """Args: head: stands in front of each line. left_of_all: None: time left is that of the part, at its rate."""
         self._head, self._what, self._width, self._terminal = head, "", 0, sys.stderr.isatty()
+        self._left_of_all = left_of_all
 
     def __enter__(self) -> Self:
         return self
@@ -33,6 +38,7 @@ class Counting:
     def __call__(self, what: str, done: int, total: int) -> None:
         """Report progress of the part `what`; a `total` of 0 is unknown."""
         now = clock.monotonic()
+        left = self._left_of_all(what, done, total) if self._left_of_all else None
         if what != self._what:
             self._what, self._began, self._first = what, now, done
         elif now - self._last < (UPDATE_SECONDS if self._terminal else PLAIN_EVERY_SECONDS):
@@ -41,7 +47,9 @@ class Counting:
         line = f"{self._head}{what}{f' {done}/{total}' if total else f' {done}' if done else ''}"
         if total and done > self._first:
             seconds = (now - self._began) / (done - self._first)
-            line += f"  {1 / max(seconds, 1e-9):.1f}/s  {duration((total - done) * seconds)} left"
+            line += f"  {1 / max(seconds, 1e-9):.1f}/s"
+            line += f"  {duration((total - done) * seconds)} left" if left is None else ""
+        line += "" if left is None else f"  {duration(left)} to the end"
         (self._replace_line if self._terminal else say)(line)
 
     def _replace_line(self, line: str) -> None:
@@ -52,10 +60,10 @@ class Counting:
 
 
 @contextmanager
-def step_progress(names: Sequence[str], name: str) -> Iterator[Counting]:
+def step_progress(names: Sequence[str], name: str, left_of_all: LeftOfAll | None = None) -> Iterator[Counting]:
     """Show the progress of one of several steps, then how long it took."""
     head, began = step_head(names, name), clock.monotonic()
-    with Counting(f"{head}: ") as progress:
+    with Counting(f"{head}: ", left_of_all) as progress:
         yield progress
     say(f"{head:<13} {duration(clock.monotonic() - began)}")
 

@@ -46,7 +46,7 @@ class Run(Command):
     out: Path = field(metadata={"place": "OUT"})
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
-    """A first look in a minute or two: at most 60 frames, 320 px wide. Not for scores."""
+    """A first look in less than a minute on two cores: at most 60 frames, 320 px wide. Not for scores."""
     segment: int = 0
     """Segment of `endoprior scan` to use, from 1; 0 is the best one. --start or --end choose any part."""
     all_segments: bool = False
@@ -64,8 +64,7 @@ class Run(Command):
 
     def execute(self) -> int | None:
         """Do every step, with one progress display."""
-        from ..pipeline import Job, notes_of, open_folder, problems, removed_if_rejected, run_step, steps_of, verdict_of
-        from ..runs import kernel_cache
+        from ..pipeline import Job, open_folder, problems, verdict_of
         from ..runs.log import missed_tools_line
 
         began = clock.perf_counter()
@@ -74,25 +73,7 @@ class Run(Command):
         job = self.job(say)
         resumes = open_folder(job)
         say(_part_words(job) if isinstance(job, Job) else f"{job.source}: a sequence folder, trained as it is")
-        steps = steps_of(job)
-        waiting, names = [step for step in steps if not step.result(job).exists()], [step.name for step in steps]
-        if resumes:
-            say(resume_words(names, [step.name for step in waiting]))
-        kernel_cache.fill(job.cfg, say)
-        try:
-            with removed_if_rejected(job):
-                for step in steps:
-                    if step in waiting:
-                        with step_progress(names, step.name) as progress:
-                            lines = run_step(step, job, progress)
-                    else:
-                        say(f"{step_head(names, step.name):<13} done before")
-                        lines = notes_of(step, job)
-                    for line in lines or []:
-                        say(f"     {line}")
-        except KeyboardInterrupt:
-            say("Stopped. To resume, run the same command again.")
-            raise
+        _do_steps(job, resumes=resumes)
         say(f"\n{last_words(verdict_of(job), duration(clock.perf_counter() - began), job.player)}")
         results = {"video": job.rendered_video, "report": job.report, "check": job.figure, "scene": job.run}
         for what, path in results.items():
@@ -142,6 +123,53 @@ class Run(Command):
             for name in [f"segment_{number}" if number else "whole"]
         ]
         return do_all(entries, self.out, str(self.video))
+
+
+def _do_steps(job: SequenceJob, *, resumes: bool) -> None:
+    """Say how long it will take, compile kernels if that was not done, and do the steps that are left."""
+    from ..pipeline import (
+        COMPILE,
+        Forecast,
+        HandedOn,
+        notes_of,
+        parts_of,
+        removed_if_rejected,
+        run_step,
+        steps_of,
+    )  # fmt: skip
+    from ..runs import kernel_cache
+
+    steps = steps_of(job)
+    waiting, names = [step for step in steps if not step.result(job).exists()], [step.name for step in steps]
+    if resumes:
+        say(resume_words(names, [step.name for step in waiting]))
+    first = [COMPILE] if waiting and not kernel_cache.is_filled(job.cfg) else []
+    names, handed_on = first + names, HandedOn()
+    forecast = Forecast(parts_of(job, first + [step.name for step in waiting]))
+    if waiting:
+        say(f"about {duration(forecast.left())} in all")
+
+    def shown(name: str) -> AbstractContextManager[Counting]:
+        forecast.begin(name)
+        return step_progress(names, name, lambda *news: forecast.after(name, *news))
+
+    try:
+        with removed_if_rejected(job):
+            for name in first:
+                with shown(name) as progress:
+                    kernel_cache.fill(job.cfg, progress=lambda *done: progress("kernels, once", *done))
+            for step in steps:
+                if step in waiting:
+                    with shown(step.name) as progress:
+                        lines = run_step(step, job, progress, handed_on)
+                else:
+                    say(f"{step_head(names, step.name):<13} done before")
+                    lines = notes_of(step, job)
+                for line in lines or []:
+                    say(f"     {line}")
+    except KeyboardInterrupt:
+        say("Stopped. To resume, run the same command again.")
+        raise
 
 
 def _part_words(job: Job) -> str:

@@ -41,6 +41,14 @@ class FrameSpan(Protocol):
     def stop(self) -> int: ...
 
 
+@dataclass(frozen=True)
+class Looks:
+    """What the frames show, in short, for the plan of windows; `T` frames."""
+
+    thumbnails: NDArray[np.float32]  # (T, h, w, 3) color in [0, 1]
+    depth_mm: NDArray[np.float64]  # (T,) median of the measured depth; NaN without
+
+
 @dataclass(eq=False, repr=False)
 class FrameSequence:
     """Frames of one scene, decoded when they are used; a cache keeps as many as memory allows, 1 MB per 110,000 px."""
@@ -80,6 +88,8 @@ class FrameSequence:
     trained on nor scored. None: all alike (`data.reliability ignored`)."""
     reading: DataConfig | None = None
     """How `load_sequence` read it; None for a sequence that was made in another way."""
+    looks: Looks | None = None
+    """What `window_plan.look_through` found; None before."""
 
     def __post_init__(self) -> None:
         self._states = [state_of(file) for file in self.files]
@@ -241,7 +251,7 @@ class FrameSequence:
     def _with(self, **changes: Any) -> FrameSequence:
         """A view of this sequence with other attributes; frames that are read in another way are cached anew."""
         view = copy(self)
-        vars(view).update(changes)
+        vars(view).update({"looks": None} | changes)
         if "_read_frame" in changes:
             view._cache = BoundedCache(cache_bytes(), _frame_bytes)
         return view

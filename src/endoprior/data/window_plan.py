@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.types import Camera
-from .sequence import FrameSequence
+from .sequence import FrameSequence, Looks
 
 TURN_DEGREES = 15.0
 """A window ends where the camera has turned by this since the window's first frame, degrees, ..."""
@@ -26,16 +24,14 @@ window is worse by up to 4 dB near its end."""
 THUMBNAIL = (32, 24)  # (width, height) of the pictures that are compared, px: noise and texture are averaged out
 
 
-@dataclass(frozen=True)
-class Looks:
-    """What the frames show, in short; `T` frames."""
-
-    thumbnails: NDArray[np.float32]  # (T, h, w, 3) color in [0, 1]
-    depth_mm: NDArray[np.float64]  # (T,) median of the measured depth; NaN without
-
-
 def look_through(sequence: FrameSequence) -> Looks:
     """Decode every training frame once; a held-out frame counts as the training frame before it, or the first one."""
+    if sequence.looks is None:
+        sequence.looks = _look_through(sequence)
+    return sequence.looks
+
+
+def _look_through(sequence: FrameSequence) -> Looks:
     training = np.array(sequence.indices("train"))
     thumbnails = np.zeros((len(training), *THUMBNAIL[::-1], 3), np.float32)
     depth_mm = np.full(len(training), np.nan)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..system.atomic import remove_leftovers, temporary_sibling, whole_file, whole_folder, write_json
 from .description import TOOLS_FOUND, read_description
-from .images import decode_image, read_tool_mask, save_png
+from .images import decode_image, encode_png, read_tool_mask, save_png
 from .sequence import FrameSequence
 
 NOTE = "changes.json"  # In the folder of the original masks: the files that were changed, and by how many pixels
@@ -144,6 +144,7 @@ def replace_depth(folder: Path, files: Iterable[tuple[str, NDArray[np.uint16]]])
 
 
 FARTHEST_UNIT = 65534  # of the depth files; 65535 stands for missing depth in the files of many programs
+COMPRESSION = 2  # of the images; noise does not compress well anyway
 TOOL_VALUE = 255  # Value of tool pixels in `masks/`; tissue is 0
 
 
@@ -182,7 +183,18 @@ class FrameFiles:
         depth: NDArray[np.float32] | None = None,
         right: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Append one frame: image, mask that is True on tools, and z in mm, 0 or not finite where it is missing.
+        """Append one frame; arguments as in `encoded`."""
+        self.append(self.encoded(rgb, tool_mask, depth, right))
+
+    def encoded(
+        self,
+        rgb: NDArray[np.uint8],
+        tool_mask: NDArray[np.bool_],
+        depth: NDArray[np.float32] | None = None,
+        right: NDArray[np.uint8] | None = None,
+    ) -> dict[str, bytes]:
+        """The files of one frame by folder: image, mask that is True on tools, and z in mm, 0 or not finite where it is
+        missing. Several threads can encode at the same time.
 
         Depth and the image of the right camera are there in every frame of a sequence, or in none.
         """
@@ -190,12 +202,17 @@ class FrameFiles:
         for name, array in (("rgb", rgb), ("tool_mask", tool_mask), ("depth", depth), ("right", right)):
             if array is not None and array.shape[:2] != size:
                 raise ValueError(f"{name} must be {size[0]} x {size[1]} pixels; got {array.shape}. Resize it first.")
-        self.write_image("images", rgb)
-        self.write_image("masks", np.where(tool_mask, TOOL_VALUE, 0).astype(np.uint8))
+        images: dict[str, NDArray] = {"images": rgb, "masks": np.where(tool_mask, TOOL_VALUE, 0).astype(np.uint8)}
         if depth is not None:
-            self.write_image("depth", self.depth_units(depth))
+            images["depth"] = self.depth_units(depth)
         if right is not None:
-            self.write_image("right", right)
+            images["right"] = right
+        return {folder: encode_png(pixels, COMPRESSION) for folder, pixels in images.items()}
+
+    def append(self, encoded: dict[str, bytes]) -> None:
+        """Write the files of the next frame, as `encoded` gave them."""
+        for folder, data in encoded.items():
+            self._file(f"{folder}/{self.count:06d}.png").write_bytes(data)
         self.count += 1
 
     def depth_units(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -205,7 +222,7 @@ class FrameFiles:
 
     def write_image(self, folder: str, pixels: NDArray) -> None:
         """Write an image (`encode_png`) as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends."""
-        save_png(self._file(f"{folder}/{self.count:06d}.png"), pixels, 2)  # noise does not compress well anyway
+        self._file(f"{folder}/{self.count:06d}.png").write_bytes(encode_png(pixels, COMPRESSION))
 
     def write_array(self, name: str, array: NDArray) -> None:
         """Write `name` (relative, `.npy`)."""

@@ -25,6 +25,7 @@ OUTLIER_DB = 3.0  # A frame whose PSNR lies this far below the median of its spl
 EXACT = "infinite: the rendered frames equal the true ones exactly"
 """Why there is no PSNR where no frame has any error; black frames, for example."""
 NETWORKS_OFF = "network scores were not asked for"
+SPEED_OFF = "the speed of rendering was not asked for"
 NO_SCENE = "needs a scene; there are rendered images only"
 TOO_SLOW = "needs other frames of the video, which a radiance field renders for hours on a CPU"
 NO_GAUSSIANS = "needs the Gaussians of a scene; this one has none"
@@ -101,7 +102,7 @@ class RenderedFrames:
     """Rendered frames by index: each is rendered when first asked for, and kept as memory allows."""
 
     def __init__(self, reconstruction: Reconstruction, sequence: FrameSequence, split: Split) -> None:
-        self._reconstruction, self._sequence = reconstruction, sequence
+        self._reconstruction, self.sequence = reconstruction, sequence
         self._scored = set(sequence.indices(split))
         self._cache: BoundedCache[RenderedFrame] = BoundedCache(cache_bytes(), lambda rendered: rendered.nbytes)
 
@@ -110,7 +111,7 @@ class RenderedFrames:
 
     def _render(self, index: int) -> RenderedFrame:
         color, depth = self._reconstruction.render(index)
-        camera, problem = self._sequence.camera(index), ""
+        camera, problem = self.sequence.camera(index), ""
         size = camera.height, camera.width
         for name, array, shape in (("depth", depth, size), ("color", color, (*size, 3))):
             if array is not None and (array.shape != shape or array.dtype != np.float32):
@@ -139,6 +140,8 @@ class Evaluation:
     """How good the model is, in a word, with its reasons."""
     protocols: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By name of another paper's protocol: its `tags`, `scores` and `skipped`; see `protocols.score_protocols`."""
+    rendered: RenderedFrames | None = field(default=None, repr=False)
+    """The frames that were rendered to be scored, to show them without rendering them again."""
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """Record a score, or `reason` where it is not finite; an int stays one."""
@@ -180,6 +183,8 @@ class EvaluationContext:
     """Where scores go; `add`, `add_mean`, `add_frames` and `skip` write to it."""
     given_path: NDArray[np.float64] | None = None
     """(T, 4, 4) camera-to-world, mm: stands in for the true path where there is none."""
+    speed: bool = True
+    """Whether to time the rendering, which takes a second or more."""
 
     @cached_property
     def true_path(self) -> NDArray[np.float64] | None:

@@ -32,6 +32,7 @@ def evaluate(
     split: Split = "test",
     *,
     networks: bool = True,
+    speed: bool = True,
     weights_dir: Path | None = None,
     reading: DataConfig | None = None,
     given_path: NDArray[np.float64] | None = None,
@@ -44,6 +45,7 @@ def evaluate(
             need a scene, or its Gaussians, are skipped where there are none.
         networks: also compute the scores that need a network (RAFT, LPIPS). Their weights are looked for in
             `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache, and are downloaded at last.
+        speed: also measure how many frames are rendered a second.
         reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default.
         given_path: (T, 4, 4) camera-to-world, mm, with which the scene's cameras are compared where the sequence has no
             true path.
@@ -68,7 +70,7 @@ def evaluate(
     result = Evaluation(_protocol(sequence, split, reading) | rendering)
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
-    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result, given_path)
+    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result, given_path, speed)
     for name, scorer in scorers().items():
         with context.skip_if_unavailable(*(score.name for score in scorer.SCORES)):
             try:
@@ -77,6 +79,7 @@ def evaluate(
                 if name in SCORERS or isinstance(error, ScoreUnavailable):
                     raise
                 raise ScoreUnavailable(REGISTRY.failure(name, error)) from error
+    result.rendered = context.rendered
     result.protocol["tags"] = tags_of(OURS, context, sequence.indices(split), sequence.mask_folder, reading.shrink)
     result.protocols = score_protocols(protocols, context, scored_data(reading))
     return result

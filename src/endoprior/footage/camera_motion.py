@@ -5,9 +5,9 @@ Static is said only where it was shown: images that nothing links to the others 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import repeat
+from itertools import count, repeat
 from typing import Literal
 
 import cv2
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .alignment import align, mean_shift
-from .components import Image, Mask
+from .components import Image, InOrder, Mask
 from .optical_flow import follow_both_ways
 
 WORK_WIDTH = 320  # Images are resized to this width, px: enough for hundreds of corners, and fast
@@ -97,31 +97,26 @@ class _Seen:
     chain: NDArray  # (3, 3) transform from that one
 
 
-def camera_motion(images: Iterable[Image], tissue_masks: Iterable[Mask] | None = None) -> CameraMotion:
+def camera_motion(
+    images: Iterable[Image], tissue_masks: Iterable[Mask] | None = None, each: InOrder = map
+) -> CameraMotion:
     """Chain similarity transforms between successive images: of tracked corners by RANSAC, else of direct alignment.
 
-    An image that nothing links is stepped over. Of the K images (H, W, 3) only three are in memory at a time. Tissue is
-    where the masks (H, W) are True; None allows all.
+    An image that nothing links is stepped over. Of the K images (H, W, 3) only a few are in memory at a time.
+
+    Args:
+        tissue_masks: (H, W) True on tissue; None allows all.
+        each: as `map`; threads can give the results, in order.
     """
     shifts, path, stretch, direct = list[float](), list[float](), list[int](), 0
     before: _Seen | None = None
     anchor: _Seen | None = None
     size, factor = (1, 1), 1.0
     masks = repeat(None) if tissue_masks is None else tissue_masks
-    for index, (image, mask) in enumerate(zip(images, masks, strict=False)):
-        factor = min(1.0, WORK_WIDTH / image.shape[1])
-        fy = max(factor, 1 / image.shape[0])  # a strip keeps its one row
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        gray = np.asarray(cv2.resize(gray, None, fx=factor, fy=fy, interpolation=cv2.INTER_AREA), np.uint8)
-        size, allowed = gray.shape[::-1], None
-        if mask is not None:
-            allowed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-            allowed = np.asarray(cv2.erode(allowed, np.ones((5, 5))), np.uint8)
-        now = _Seen(gray, allowed, index, np.eye(3))
+    for now, factor, (step, is_direct) in each(_linked, _with_last(each(_seen, zip(count(), images, masks)))):
+        index, size = now.first, now.gray.shape[::-1]
         if before is not None:
-            step = _step(before, now)
-            if step is None and (step := _aligned(before, now)) is not None:
-                direct += 1
+            direct += is_direct
             shifts.append(np.nan if step is None else mean_shift(step, *size) / factor)
             if step is not None:
                 now = replace(now, first=before.first, chain=step @ before.chain)
@@ -136,6 +131,40 @@ def camera_motion(images: Iterable[Image], tissue_masks: Iterable[Mask] | None =
     few = direct > FEW_CORNERS * max(int(np.isfinite(steps).sum()), 1)
     limit = MOVING_FRACTION * size[0] / factor
     return CameraMotion(steps, np.array(path), np.array(stretch), limit, few)
+
+
+def _seen(numbered: tuple[int, Image, Mask | None]) -> tuple[_Seen, float]:
+    """An image (H, W, 3) of this number as it is compared, and its size as a share of that of the image."""
+    index, image, mask = numbered
+    factor = min(1.0, WORK_WIDTH / image.shape[1])
+    fy = max(factor, 1 / image.shape[0])  # a strip keeps its one row
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    gray = np.asarray(cv2.resize(gray, None, fx=factor, fy=fy, interpolation=cv2.INTER_AREA), np.uint8)
+    allowed = None
+    if mask is not None:
+        allowed = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        allowed = np.asarray(cv2.erode(allowed, np.ones((5, 5))), np.uint8)
+    return _Seen(gray, allowed, index, np.eye(3)), factor
+
+
+def _with_last(images: Iterable[tuple[_Seen, float]]) -> Iterator[tuple[_Seen | None, _Seen, float]]:
+    """Each image with the one before."""
+    last = None
+    for now, factor in images:
+        yield last, now, factor
+        last = now
+
+
+def _linked(pair: tuple[_Seen | None, _Seen, float]) -> tuple[_Seen, float, tuple[NDArray | None, bool]]:
+    """The transform from the image before, None if there is none; and whether only direct alignment found it."""
+    before, now, factor = pair
+    if before is None:
+        return now, factor, (None, False)
+    step = _step(before, now)
+    if step is not None:
+        return now, factor, (step, False)
+    step = _aligned(before, now)
+    return now, factor, (step, step is not None)
 
 
 def _aligned(before: _Seen, now: _Seen) -> NDArray | None:

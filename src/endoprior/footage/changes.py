@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask, runs
-from .disturbances import disturbances, measure_quality, small_size
+from .components import Image, InOrder, Mask, runs
+from .disturbances import FrameQuality, disturbances, measure_quality, small_size
 from .scenes import THUMB_WIDTH as SCENE_WIDTH
 from .scenes import View, change, jumps, same_view, standardized
 
@@ -59,17 +60,31 @@ class Changes:
     weights: NDArray[np.float64]  # (T,) how far each is to be believed, in [0, 1]: 1, or less where smoke or blur lies
 
 
-def find_changes(images: Iterable[Image]) -> Changes:
-    """Measure the curves and detect conspicuous images, of T >= 1 images (H, W, 3) of one size; each is used once."""
-    thumbs, sharpness, shares, qualities = [], [], [], []
-    for image in images:
-        size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * image.shape[0] / image.shape[1]))
-        color = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        thumbs.append(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
-        shares.append(color_share(color))
-        sharpness.append(_sharpness(image))
-        small = cv2.resize(image, small_size(image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
-        qualities.append(measure_quality(np.asarray(small, np.uint8), np.ones(small.shape[:2], bool)))
+class _Measured(NamedTuple):
+    """What is kept of one image."""
+
+    thumb: NDArray[np.float32]  # (h, w) gray levels
+    share: NDArray[np.float64]  # (2,) see `color_share`
+    sharpness: float
+    quality: FrameQuality
+
+
+def _measured(image: Image) -> _Measured:
+    size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * image.shape[0] / image.shape[1]))
+    color = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = cv2.resize(image, small_size(image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
+    quality = measure_quality(np.asarray(small, np.uint8), np.ones(small.shape[:2], bool))
+    thumb = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32)
+    return _Measured(thumb, color_share(color), _sharpness(image), quality)
+
+
+def find_changes(images: Iterable[Image], each: InOrder = map) -> Changes:
+    """Measure the curves and detect conspicuous images, of T >= 1 images (H, W, 3) of one size; each is used once.
+
+    Args:
+        each: as `map`; threads can give the results, in order.
+    """
+    thumbs, shares, sharpness, qualities = zip(*each(_measured, images), strict=True)
     pairs, sharp = list(pairwise(thumbs)), np.array(sharpness)
     difference = np.array([np.abs(now - before).mean() for before, now in pairs], np.float64)
     seconds = np.arange(len(thumbs)) / USUAL_RATE

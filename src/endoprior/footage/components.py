@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol, TypeVar
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8]  # Color (H, W, 3) or gray (H, W), 0..255
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 LEFT, TOP, WIDTH, HEIGHT, AREA = range(5)  # Columns of the boxes of `components`
+
+
+class InOrder(Protocol):
+    """As `map`: what a function gives for each item, in order. Threads may call it for several items at a time."""
+
+    def __call__(self, function: Callable[[Item], Result], items: Iterable[Item], /) -> Iterator[Result]: ...
 
 
 def components(mask: Mask, connectivity: int = 8) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.geometry import CONVENTIONS, Convention, to_ours
 from ..core.ranges import spread
-from .components import Image, square
+from .components import Image, InOrder, square
 from .optical_flow import follow_both_ways
 
 View = tuple[Image, NDArray, NDArray[np.float32]]
@@ -130,6 +130,7 @@ def measure_poses(
     *,
     turn: NDArray[np.float64] | None = None,
     relative: bool = False,
+    each: InOrder = map,
 ) -> PoseFit | None:
     """Compare all conventions of poses; None if the poses do not move, or if too few corners can be followed.
 
@@ -139,6 +140,7 @@ def measure_poses(
         poses: (T, 4, 4) as the file has them, which is read as `given` at present.
         turn: (3, 3) rotation from the camera that the poses belong to, to that of the frames.
         relative: whether the unit of the depth is unknown, so that any unit of the poses is right.
+        each: as `map`; threads can give the results, in order.
     """
     if len(poses) < 2 or np.abs(poses - poses[0]).max() < 1e-6:
         return None
@@ -147,7 +149,11 @@ def measure_poses(
     px = 640 / (factor * width)
     matrix = np.diag([factor, factor, 1]) @ matrix + [[0, 0, (factor - 1) / 2], [0, 0, (factor - 1) / 2], [0, 0, 0]]
     starts = spread(len(poses) - 1, STARTS)
-    tracks = [found for i in starts if (found := _follow(lambda j: _small(view(j), factor), matrix, i, len(poses)))]
+
+    def follow(start: int) -> _Tracks | None:
+        return _follow(lambda j: _small(view(j), factor), matrix, start, len(poses))
+
+    tracks = [found for found in each(follow, starts) if found]
     if not tracks:
         return None
 

@@ -14,7 +14,6 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from ..core.checks import check_shape
 from .components import Image, Mask
@@ -89,7 +88,13 @@ def _shading(values: NDArray, image: Image, where: Mask) -> float | None:
     a, b = brightness.reshape(-1)[picked], values.reshape(-1)[picked]
     if len(picked) < MIN_PIXELS or a.min() == a.max() or b.min() == b.max():
         return None
-    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+    return float(np.corrcoef(_ranks(a), _ranks(b))[0, 1])
+
+
+def _ranks(values: NDArray) -> NDArray[np.float64]:
+    """(N,) the rank of each of N values, from 1; equal ones share their mean rank. scipy.stats imports for 0.4 s."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count - 1) / 2)[place]
 
 
 def _tool_ratio(values: NDArray, valid: Mask, tissue: Mask) -> float | None:

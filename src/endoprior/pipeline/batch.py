@@ -22,6 +22,7 @@ from ..runs.train import WindowedRun
 from ..system.atomic import write_text
 from ..system.devices import Threads
 from ..system.ray_cluster import Cluster
+from .handed_on import HandedOn
 from .job import SequenceJob, open_folder
 from .steps import SHOWN_SCORES, run_step, start_training, steps_of, verdict_of
 
@@ -70,10 +71,11 @@ def run_here(
     for entry in entries:
         try:
             _open(entry)
+            handed_on = HandedOn()
             for step in steps_of(entry.job):
                 if not step.result(entry.job).exists():
                     with shown(entry, step.name) as progress:
-                        run_step(step, entry.job, progress)
+                        run_step(step, entry.job, progress, handed_on)
         except Exception as error:
             yield Outcome(entry, _reason(entry, error))
         else:
@@ -127,13 +129,14 @@ def _opened(entry: Entry) -> Outcome | None:
 def begin(job: SequenceJob, threads: Threads) -> list[Training]:
     """Do the steps of a job before its training, in this process; what is left to train."""
     threads.use()
+    handed_on = HandedOn()
     for step in steps_of(job):
         if step.name == "train":
             break
-        run_step(step, job, _quiet)
+        run_step(step, job, _quiet, handed_on)
     if step.result(job).exists():
         return []
-    run, _ = start_training(job)
+    run, _ = start_training(job, handed_on.sequence)
     if isinstance(run, WindowedRun):
         with run.opened():
             return trainings(run)
@@ -143,8 +146,9 @@ def begin(job: SequenceJob, threads: Threads) -> list[Training]:
 def finish(job: SequenceJob, threads: Threads) -> None:
     """Do the steps of a job that are left, in this process. Windows that are trained are joined by the training."""
     threads.use()
+    handed_on = HandedOn()
     for step in steps_of(job):
-        run_step(step, job, _quiet)
+        run_step(step, job, _quiet, handed_on)
 
 
 def _quiet(_what: str, _done: int, _total: int) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 from ..core.checks import input_error
 from ..core.shell import command, command_of
 from ..data.files import read_json
+from ..footage.components import Image
 from ..prepare.first_pass import source_facts
 from ..prepare.scan import scan_video
 from ..prepare.segments import Stretch, as_json, best_segment, from_json, segments_of
@@ -30,6 +31,7 @@ class Choice:
 
     scanned: dict[str, Any]  # what `scan.json` holds, with a hash of the video's identity
     number: int  # of the segment, from 1; 0 for the whole video: one segment, or none at all
+    pictures: tuple[Image, ...] = ()  # a few small images of the video; none if its scan was stored
 
     @cached_property
     def stretches(self) -> list[Stretch]:
@@ -80,14 +82,15 @@ def choose_segment(video: Path, out: Path, folder_rate: float, wanted: int = 0) 
     facts = json.dumps(source_facts(video) | {"folder_rate": folder_rate})
     identity = hashlib.sha256(facts.encode()).hexdigest()  # its name may be that of a patient
     stored = [read_json(folder / SCAN) for folder in (out, out.parent) if (folder / SCAN).is_file()]
-    scanned = next((each for each in stored if each.get("video") == identity), None)
+    scanned, pictures = next((each for each in stored if each.get("video") == identity), None), ()
     if scanned is None:
-        scanned = as_json(scan_video(video, folder_rate)) | {"video": identity}
-    choice = Choice(scanned, 0)
+        scan = scan_video(video, folder_rate)
+        scanned, pictures = as_json(scan) | {"video": identity}, tuple(scan.pictures)
+    choice = Choice(scanned, 0, pictures)
     count, is_whole = len(choice.segments), len(choice.stretches) == 1
     if not 0 <= wanted <= max(count, 1):
         got = f"{wanted}, with {count} in {video}"
         raise input_error("--segment", "the number of a segment", got, f"`{command('scan', video)}` lists them.")
     if not count or is_whole:
         return choice
-    return Choice(scanned, wanted or best_segment(choice.segments) + 1)
+    return Choice(scanned, wanted or best_segment(choice.segments) + 1, pictures)

@@ -19,9 +19,11 @@ from ..check.report import as_json
 from ..core.checks import input_error, quotation
 from ..core.config import Config
 from ..core.shell import command, command_of
+from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
 from ..data.description import MOTION, read_description
 from ..data.files import read_json
+from ..evaluation.context import RenderedFrame, RenderedFrames, SceneFrames
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..evaluation.verdict import WORDS, Facts, Verdict, verdict_on
@@ -37,12 +39,16 @@ from ..runs.log import mask_facts, missed_tools_of
 from ..runs.report import write_report
 from ..runs.train import TrainingRun, WindowedRun, start_run
 from ..system.atomic import write_json
-from ..visualization.image_tools import colorize, label, tile, to_u8
+from ..system.parallel import Pool, frame_threads
+from ..training.trainer import StepReport, Trainer
+from ..visualization.image_tools import colorize, label, tile
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
 from .choice import SCAN
+from .handed_on import HandedOn
 from .job import Job, SequenceJob
 
+PICTURE_BYTES = 60  # memory in which a thread composes an image of the video, bytes for each px of a frame
 PLAYER_BYTES = 40_000_000  # largest player
 LEAST_BYTES = 7  # size of one Gaussian at one time step in the player; at least this (docs/export.md)
 TITLE_LETTERS = 150  # in a line above the report
@@ -59,14 +65,18 @@ class Step:
 
     name: str
     result: Callable[[SequenceJob], Path]  # file or folder that is there when the step is done
-    act: Callable[[SequenceJob, Progress], list[str]]  # does it; returns lines for the user
+    act: Callable[[SequenceJob, Progress, HandedOn], list[str]]  # does it; returns lines for the user
 
 
-def run_step(step: Step, job: SequenceJob, progress: Progress) -> list[str] | None:
-    """Do a step, and keep what it returns for a resumed job; None if it was done before."""
+def run_step(step: Step, job: SequenceJob, progress: Progress, handed_on: HandedOn | None = None) -> list[str] | None:
+    """Do a step, and keep what it returns for a resumed job; None if it was done before.
+
+    Args:
+        handed_on: what the steps before have left for this one, and gets what it leaves for the next ones.
+    """
     if step.result(job).exists():
         return None
-    lines = step.act(job, progress)
+    lines = step.act(job, progress, handed_on or HandedOn())
     write_json(job.notes, _stored_notes(job) | {step.name: lines})
     return lines
 
@@ -81,18 +91,19 @@ def _stored_notes(job: SequenceJob) -> dict[str, Any]:
     return read_json(job.notes) if job.notes.is_file() else {}
 
 
-def _prepare(job: SequenceJob, progress: Progress) -> list[str]:
+def _prepare(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
     assert isinstance(job, Job), "a sequence folder is prepared"
-    done = prepare(job.source, job.data, job.prepare, progress)
+    done = prepare(job.source, job.data, job.prepare, progress, handed_on.facts)
     if job.choice:
-        draw_scan(job.source, job.choice.scanned, (job.out / SCAN).with_suffix(".png"), job.prepare.folder_rate)
+        choice, figure = job.choice, (job.out / SCAN).with_suffix(".png")
+        draw_scan(job.source, choice.scanned, figure, job.prepare.folder_rate, choice.pictures)
     return [f"{done.num_frames} frames of {done.size[0]}x{done.size[1]}", *(f"note: {note}" for note in done.notes)]
 
 
-def _check(job: SequenceJob, progress: Progress) -> list[str]:
+def _check(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
     progress("measuring", 0, 0)
-    sequence = load_sequence(job.data, job.cfg.data)
-    facts = measure(sequence, job.cfg.data)
+    sequence = handed_on.sequence = load_sequence(job.data, job.cfg.data)
+    facts = measure(sequence, job.cfg.data, handed_on.facts)
     findings = find(facts)
     draw_check(sequence, facts, findings, job.figure)
     write_json(job.findings, as_json(facts, findings))
@@ -112,9 +123,11 @@ def problems(job: SequenceJob) -> str:
     return f"Found by check: {', '.join(codes)}. {fix}" if codes else ""
 
 
-def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[str]]:
-    """The run of a job, new or resumed, and lines for the user."""
-    sequence = load_sequence(job.data, job.cfg.data)
+def start_training(
+    job: SequenceJob, sequence: FrameSequence | None = None
+) -> tuple[TrainingRun | WindowedRun, list[str]]:
+    """The run of a job, new or resumed, and lines for the user. Args: sequence: as the job reads it, if it is open."""
+    sequence = sequence or load_sequence(job.data, job.cfg.data)
     cfg, notes, usable = job.cfg, list[str](), (0, len(sequence))
     if isinstance(job, Job):
         unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
@@ -147,9 +160,19 @@ def demand_known_motion(job: Job, sequence: FrameSequence, unexplained: list[int
     raise input_error(job.source, want, got, f"{fix}. To train on this part all the same: `{again}`.")
 
 
-def _train(job: SequenceJob, progress: Progress) -> list[str]:
-    run, notes = start_training(job)
-    scene = run.complete(lambda _report, trainer: progress("training", *trainer.progress()))
+def _train(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
+    run, notes = start_training(job, handed_on.sequence)
+    handed_on.sequence = None  # the run has it, and what it decoded
+    num_windows, before, last = len(run.waiting(job.run)) if isinstance(run, WindowedRun) else 1, 0, 0
+
+    def observer(_report: StepReport, trainer: Trainer) -> None:
+        nonlocal before, last
+        done, total = trainer.progress()
+        before, last = before + (total if done < last else 0), done
+        progress("training", before + done, max(num_windows * total, before + total))
+
+    progress("starting", 0, 0)
+    scene = run.complete(observer)
     return [*notes, f"{len(_of_gaussians(scene)):,} Gaussians"]
 
 
@@ -158,11 +181,12 @@ def _of_gaussians(scene: RenderedScene) -> Scene:
     return scene
 
 
-def _score(job: SequenceJob, progress: Progress) -> list[str]:
+def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
     progress("rendering held-out frames", 0, 0)
     scene = _of_gaussians(load_scene(job.run))
     sequence = _frames_of(job, scene.config)
-    result = evaluate(scene, sequence, networks=False)
+    result = evaluate(scene, sequence, networks=False, speed=not job.is_preview)
+    handed_on.rendered = result.rendered
     result.protocol |= mask_facts(job.run)
     missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
@@ -187,30 +211,38 @@ def verdict_of(job: SequenceJob) -> Verdict | None:
     return Verdict(stored["word"], tuple(quotation(str(reason)) for reason in stored.get("reasons", [])))
 
 
-def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
+def _render_video(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
     scene = _of_gaussians(load_scene(job.run))
-    sequence = _frames_of(job, scene.config).with_poses(scene.cameras)
-    frames, left_out = sequence.frames("video"), set(sequence.left_out)
+    rendered = handed_on.rendered or _rendered(job, scene)
+    frames, left_out = rendered.sequence.frames("video"), set(rendered.sequence.left_out)
     span = depth_span(scene)
 
-    def images() -> Iterator[NDArray[np.uint8]]:
-        for k, frame in enumerate(frames):
-            view = scene.filmed(frame.time, frame.camera)
-            depth = view.depth.cpu().numpy()
-            name = "EndoPrior-GS" + (" (frame not used)" if frame.index in left_out else "")
-            shown = {
-                "input": frame.rgb_u8,
-                name: to_u8(view.color.cpu().numpy()),
-                "depth": colorize(depth, *span, depth > 0),
-            }
-            yield tile([label(image, name) for name, image in shown.items()], len(shown))
+    def picture(seen: tuple[Frame, RenderedFrame]) -> NDArray[np.uint8]:
+        frame, view = seen
+        name = "EndoPrior-GS" + (" (frame not used)" if frame.index in left_out else "")
+        shown = {"input": frame.rgb_u8, name: view.rgb_u8, "depth": colorize(view.depth, *span, view.depth > 0)}
+        return tile([label(image, name) for name, image in shown.items()], len(shown))
+
+    def images(pool: Pool) -> Iterator[NDArray[np.uint8]]:
+        views = ((frame, rendered[frame.index]) for frame in frames)  # rendering has threads of its own
+        for k, image in enumerate(pool.map(picture, views)):
+            yield image
             progress("rendering", k + 1, len(frames))
 
-    write_video(job.rendered_video, images(), scene.frames_per_second)
+    first = scene.cameras[0]
+    with frame_threads(PICTURE_BYTES * first.width * first.height) as pool:
+        write_video(job.rendered_video, images(pool), scene.frames_per_second)
+    handed_on.rendered = None
     return []
 
 
-def _player(job: SequenceJob, progress: Progress) -> list[str]:
+def _rendered(job: SequenceJob, scene: Scene) -> RenderedFrames:
+    """The frames of a job, in the poses in which the scene was trained."""
+    sequence = _frames_of(job, scene.config).with_poses(scene.cameras)
+    return RenderedFrames(SceneFrames(scene, sequence), sequence, "test")
+
+
+def _player(job: SequenceJob, progress: Progress, _handed_on: HandedOn) -> list[str]:
     progress("packing", 0, 0)
     scene = _of_gaussians(load_scene(job.run))
     at_a_time = len(scene) / len(scene.windows)

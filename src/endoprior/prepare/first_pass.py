@@ -20,6 +20,7 @@ from ..footage.border import Circle, Outside, Strips, beyond, find_outline
 from ..footage.changes import are_combed
 from ..footage.overlays import find_static_overlays, find_strokes, without_strokes
 from ..footage.round_border import CERTAIN
+from ..system.memory import cache_bytes
 from .calibration import fitted
 from .config import Layout, PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
@@ -62,6 +63,7 @@ class FirstPass:
     image_names: list[str] = field(default_factory=list)  # of a source folder, without suffixes; empty for a video
     hides: bool = False  # whether drawings in single frames are searched
     moving_border: float | None = None  # level of a border that moves: see `footage.outside.beyond`
+    frames: list[StereoFrame] | None = None  # all selected frames, in order; None if they do not fit into memory
 
     def hidden(self, rgb_u8: Image) -> Mask:
         """(H, W) True where a frame (H, W, 3) shows nothing of the body, and others do: drawings, or a border."""
@@ -98,9 +100,9 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
         InputError: too few or too many frames, or a file is damaged.
     """
     path, size = clip.source.path, clip.camera_size
-    indices, damaged, samples, selection = _look_through(clip, cfg)
+    indices, damaged, samples, selection, frames = _look_through(clip, cfg)
     if clip.was_damaged:  # again, now by one thread, which finds all damage
-        indices, damaged, samples, selection = _look_through(clip, cfg)
+        indices, damaged, samples, selection, frames = _look_through(clip, cfg)
     if len(indices) < 2:
         fix = "Check --start, --end and --frames-per-second."
         raise input_error(str(path), "at least 2 frames in the selection", str(len(indices)), fix)
@@ -144,27 +146,38 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
     level = other.level if other and other.moves else None
     hides = cfg.border == "auto"
-    return FirstPass(indices, samples, geometry, notes, video_notes, damaged, clip.stored_size, names, hides, level)
+    return FirstPass(
+        indices, samples, geometry, notes, video_notes, damaged, clip.stored_size, names, hides, level, frames
+    )
 
 
 def _look_through(
     clip: Clip, cfg: PrepareConfig
-) -> tuple[list[int], frozenset[int], list[StereoFrame], FrameSelection]:
-    """Positions of the selected frames, the damaged ones, samples, and the selection; InputError if too many."""
+) -> tuple[list[int], frozenset[int], list[StereoFrame], FrameSelection, list[StereoFrame] | None]:
+    """Positions of the selected frames, the damaged ones, samples, the selection, and the frames themselves if all of
+    them fit into memory; InputError if too many.
+    """
     indices, damaged, samples, every, selection = list[int](), set[int](), list[StereoFrame](), 1, clip.selection()
+    frames: list[StereoFrame] | None = []
+    space = cache_bytes()
     for count, frame in enumerate(clip.stereo_frames(selection)):
         if count % every == 0 and len(samples) == SAMPLES:
             samples, every = samples[::2], 2 * every
         if count % every == 0:
             samples.append(frame)
         indices.append(frame.index)
+        space -= frame.nbytes
+        if space < 0:
+            frames = None
+        elif frames is not None:
+            frames.append(frame)
         if frame.damaged:
             damaged.add(frame.index)
         if len(indices) > cfg.max_frames:
             got = f"{clip.source.num_frames or 'more'} in the file"
             fix = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
             raise input_error(str(clip.source.path), f"at most {cfg.max_frames} frames", got, fix)
-    return indices, frozenset(damaged), samples, selection
+    return indices, frozenset(damaged), samples, selection, frames
 
 
 def _stretch(layout: Layout) -> tuple[int, int]:

@@ -19,20 +19,19 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.ranges import spread
 from ..data import load_sequence
-from ..data.description import TOOLS_FOUND
 from ..data.found_tools import FoundTools, FrameRow, write_rows
-from ..data.frame_files import match_files, match_names
+from ..data.frame_files import match_files
 from ..data.images import DEPTH_SUFFIXES, read_color, read_depth_file, read_stored, read_values, save_png
-from ..data.mask_files import tool_polarity
-from ..data.mask_folders import open_mask_folder
 from ..data.pixels import is_measured
 from ..data.writer import TOOL_VALUE, FrameFiles, found_source, write_mask
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
-from .config import NETWORK, PrepareConfig, is_sam2
+from ..system.parallel import Pool, frame_threads
+from .config import NETWORK, PrepareConfig
 from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
+from .frame_tools import BYTES_PER_PIXEL, HINT, Tools, choose_tools
 from .relative_depth import RelativeScale, fit_shading
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
@@ -46,10 +45,7 @@ FITTED_SAMPLES = 16  # number of frames to which the tool and shading models are
 MAX_ROW_OFFSET_PX = 1.5  # if the rows of the two cameras are further apart, stereo matching is poor
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
-COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete
-HINT = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
 WORK = "carried"  # folder of the segmenter's masks until the sequence is complete, for an interrupted run
-Tools = Callable[[MeasuredFrame], FoundTools]  # the tools of a frame; those that the user gives have confidence 1
 
 
 @dataclass(frozen=True)
@@ -210,91 +206,35 @@ def _inside_body(images: list[Image]) -> Callable[[Image], bool]:
     return lambda rgb_u8: usual is None or bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)
 
 
-def names_folder(masks: str) -> bool:
-    """Whether a value of --masks is a folder of the user."""
-    return masks not in ("auto", "none") and not is_sam2(masks)
-
-
-def masked_frames(cfg: PrepareConfig, first_pass: FirstPass) -> tuple[frozenset[int], int, str] | None:
-    """The frames with a mask, if there are fewer masks than frames, as in StereoMIS; None if masks decide nothing.
-
-    Returns:
-        Their positions in the source, the usual distance between them in selected frames, and a note for the user.
-    """
-    if not names_folder(cfg.masks):
-        return None
-    indices, image_names = first_pass.indices, first_pass.image_names
-    given = open_mask_folder(Path(cfg.masks), cfg.mask_labels)
-    if given.in_order_only or len(given.frames) in (len(indices), len(image_names)):
-        return None
-    names = [frame.name for frame in given.frames]
-    found = match_names(Path(cfg.masks), names, indices, image_names, required=()).files
-    places = np.searchsorted(indices, sorted(found))
-    if len(found) in (1, len(indices)) or np.ptp(places) < COVERED * (len(indices) - 1):
-        return None
-    step = int(np.median(np.diff(places)))
-    every = f"one for every {step} frames; " if step > 1 else ""
-    left_out = f"{len(indices) - len(found)} of {len(indices)} frames have none and are left out"
-    return frozenset(found), step, f"masks: {every}{left_out}"
-
-
-def choose_tools(
-    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
-) -> tuple[Tools, str, list[str]]:
-    """A function that returns the tools of a frame, the name of its source, and notes."""
-    inside = first_pass.geometry.inside
-    if names_folder(cfg.masks):
-        return _given_tools(cfg, first_pass, samples)
-    if cfg.mask_labels:
-        raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
-    if cfg.masks == "none":
-        return lambda _frame: FoundTools(np.zeros_like(inside), 1.0), "none", []
-    from ..tool_masks import ToolFinder  # imports torch
-
-    finder = ToolFinder()
-    share = np.mean([finder.find(sample.rgb_u8, inside).mask.any() for sample in samples])
-    source = f"{TOOLS_FOUND} in {share:.0%} of the samples" if share else f"no {TOOLS_FOUND}"
-    hint = HINT if share else "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
-    notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
-    return lambda frame: finder.find(frame.rgb_u8, inside), source, notes
-
-
-def _given_tools(
-    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
-) -> tuple[Tools, str, list[str]]:
-    """As `choose_tools`, from the user's files."""
-    path = Path(cfg.masks)
-    given = open_mask_folder(path, cfg.mask_labels)
-    names = [each.name for each in given.frames]
-    matched = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
-
-    def high(frame: MeasuredFrame) -> Mask:
-        return first_pass.frame_of(given.frames[matched.files[frame.index]].read)
-
-    notes = [f"masks: {each}" for each in (given.note, matched.rule) if each]
-    tool_is_high = given.tool_is_high
-    if tool_is_high is None or cfg.mask_tool_value != "auto":
-        polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
-        tool_is_high = polarity.tool_is_high
-        notes.append(f"masks: {polarity.reason}")
-    return lambda frame: FoundTools(high(frame) == tool_is_high, 1.0), "user's files", notes
-
-
 def measure_frames(
-    stereo_frames: Iterable[StereoFrame], geometry: FrameGeometry, methods: FrameMethods, first: int, used: list[int]
+    stereo_frames: Iterable[StereoFrame],
+    geometry: FrameGeometry,
+    methods: FrameMethods,
+    first: int,
+    used: list[int],
+    pool: Pool,
 ) -> Iterator[MeasuredFrame]:
     """Rectify the wanted frames and measure their depth, from position `first` on.
 
     Args:
         used: gets the position in the source of every wanted frame.
     """
-    for stereo_frame in stereo_frames:
-        frame = MeasuredFrame.of(stereo_frame, geometry, len(used))
-        if not methods.wanted(frame.rgb_u8):
-            continue
-        used.append(stereo_frame.index)
-        if frame.position >= first:
-            yield replace(frame, depth=methods.measure(frame)) if methods.measure else frame
+
+    def rectified(seen: StereoFrame) -> tuple[MeasuredFrame, bool]:
+        frame = MeasuredFrame.of(seen, geometry)
+        return frame, methods.wanted(frame.rgb_u8)
+
+    def wanted() -> Iterator[MeasuredFrame]:
+        for frame, is_wanted in pool.map(rectified, stereo_frames):
+            if is_wanted:
+                used.append(frame.index)
+                if len(used) > first:
+                    yield replace(frame, position=len(used) - 1)
+
+    def measured(frame: MeasuredFrame) -> MeasuredFrame:
+        return replace(frame, depth=methods.measure(frame)) if methods.measure else frame
+
+    yield from pool.map(measured, wanted())
 
 
 def with_neighbors(frames: Iterable[MeasuredFrame]) -> Iterator[list[MeasuredFrame]]:
@@ -327,24 +267,30 @@ def write_frames(
         Position in the source of each frame of the sequence.
     """
     done, used = files.count, []
-    # After a resume, measure a few finished frames again: the temporal filter needs their depth.
-    for window in with_neighbors(measure_frames(stereo_frames, geometry, methods, max(done - REACH, 0), used)):
+
+    def finished(window: list[MeasuredFrame]) -> tuple[int, FoundTools, dict[str, bytes]]:
+        """Position, tools and encoded files of the frame in the middle of a window."""
         frame = window[len(window) // 2]
-        if frame.position < done:
-            continue
         depth = frame.depth
         if methods.filter_in_time:
             depth = temporal_median([other.depth for other in window if other.depth is not None])
         found = methods.tools(frame)
-        on_tools(frame.position, found)
         tools = found.mask | ~geometry.inside | methods.hidden(frame.rgb_u8)
         if methods.shade:
             depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:
             depth = np.where(geometry.inside, depth, np.float32(0))
         rgb_u8 = np.where(geometry.inside[..., None], frame.rgb_u8, np.uint8(0))
-        files.add(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
-        on_frame(files.count)
+        return frame.position, found, files.encoded(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
+
+    with frame_threads(BYTES_PER_PIXEL * geometry.source_size[0] * geometry.source_size[1]) as pool:
+        # After a resume, measure a few finished frames again: the temporal filter needs their depth.
+        frames = measure_frames(stereo_frames, geometry, methods, max(done - REACH, 0), used, pool)
+        windows = (each for each in with_neighbors(frames) if each[len(each) // 2].position >= done)
+        for position, found, encoded in pool.map(finished, windows):
+            on_tools(position, found)
+            files.append(encoded)
+            on_frame(files.count)
     return used
 
 

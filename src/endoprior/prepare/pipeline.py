@@ -21,7 +21,9 @@ from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncerta
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
-from ..footage.changes import find_changes
+from ..footage.known_facts import KnownFacts
+from ..system.memory import BoundedCache, cache_bytes
+from ..system.parallel import frame_threads
 from .calibration import parse_size
 from .calibration_files import read_calibration
 from .camera_path.sequence_path import ASSUMED, CALIBRATED, PATH_RECORD, Reading, path_depth, sequence_path
@@ -29,10 +31,12 @@ from .camera_path.tracks import CameraPath, Lens, PoseInput
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
-from .frames import WORK, FrameMethods, choose_methods, masked_frames, replace_by_carried, write_frames
+from .frame_tools import masked_frames
+from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
+BYTES_PER_PX = 100  # memory in which a thread measures a written frame, bytes for each px
 DEPTH_SCALE = 0.01  # mm per unit of the 16-bit depth files: up to 655 mm
 GRID_POINTS = 9  # points a side of the grid over a rectified frame; between them the rectification is nearly linear
 Progress = Callable[[str, int, int], None]
@@ -54,8 +58,12 @@ class Prepared:
 class _Written(FrameFiles):
     """The frames of a sequence, to read again."""
 
+    def __init__(self, folder: Path, meta: SequenceMeta, count: int = 0) -> None:
+        super().__init__(folder, meta, count)
+        self._colors: BoundedCache[NDArray[np.uint8]] = BoundedCache(cache_bytes(), lambda image: image.nbytes)
+
     def color(self, index: int) -> NDArray[np.uint8]:
-        return read_color(self.file("images", index))
+        return self._colors.get(index, lambda: read_color(self.file("images", index)))
 
     def tools(self, index: int) -> NDArray[np.bool_]:
         return read_tool_mask(self.file("masks", index))
@@ -66,17 +74,22 @@ class _Written(FrameFiles):
 
 
 def prepare(
-    video: Path, out: Path, cfg: PrepareConfig | None = None, progress: Progress = lambda _what, _done, _total: None
+    video: Path,
+    out: Path,
+    cfg: PrepareConfig | None = None,
+    progress: Progress = lambda _what, _done, _total: None,
+    facts: KnownFacts | None = None,
 ) -> Prepared:
     """Write a sequence folder from a video. The same call resumes after an interruption.
 
     Args:
         video: a file, or a folder of images.
         out: a new or empty folder; it appears when the sequence is complete.
+        facts: gets facts of the frames, for steps that come later.
     Raises:
         InputError: the video, or a file named by an option, cannot be used; nothing is left behind.
     """
-    cfg = cfg or PrepareConfig()
+    cfg, facts = cfg or PrepareConfig(), facts or KnownFacts()
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
         _demand_all_frames(cfg)
@@ -92,6 +105,7 @@ def prepare(
         progress("looking at tools and light", 0, len(first_pass.indices))
         methods = choose_methods(cfg, clip, first_pass)
         files, used = _write(folder, cfg, clip, first_pass, methods, step, progress)
+        first_pass.frames = None  # they are written now
         if files.count < 2:
             fix = "Change --start, --end or --drop-out-of-body."
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
@@ -102,11 +116,12 @@ def prepare(
             from .unmasked_motion import frames_with_unmasked_motion  # imports torch
 
             rate = files.meta.frames_per_second
-            moving = frames_with_unmasked_motion(files.count, rate, files.color, files.tools, inside)
+            with frame_threads(BYTES_PER_PX * inside.size) as pool:
+                moving = frames_with_unmasked_motion(files.count, rate, files.color, files.tools, inside, pool.map)
         mark_moving(folder, moving)
-        path, motion_notes = _camera_path(cfg, files, first_pass, used, progress)
+        path, motion_notes = _camera_path(cfg, files, first_pass, used, facts, progress)
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
-        unexplained, weights = _unexplained(path, files, damaged)
+        unexplained, weights = _unexplained(path, files, damaged, facts)
         if path is not None:
             _use_path(files, path)
         shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
@@ -156,7 +171,7 @@ def _write(
         found.cut(done)
     files = _Written(folder, _meta(clip, first_pass, methods, step), done)
     used = write_frames(
-        clip.stereo_frames(clip.selection()),
+        first_pass.frames or clip.stereo_frames(clip.selection()),
         first_pass.geometry,
         methods,
         files,
@@ -186,8 +201,9 @@ def _meta(clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int) -
 
 
 def _camera_path(
-    cfg: PrepareConfig, files: _Written, first_pass: FirstPass, used: Sequence[int], progress: Progress
-) -> tuple[CameraPath | None, list[str]]:
+    cfg: PrepareConfig, files: _Written, first_pass: FirstPass, used: Sequence[int], facts: KnownFacts,
+    progress: Progress,
+) -> tuple[CameraPath | None, list[str]]:  # fmt: skip
     """Poses of the written frames, None for a static camera; and notes for the user."""
     meta, turn, everything = files.meta, first_pass.geometry.turn, range(files.count)
     progress("following the camera", 0, files.count)
@@ -205,6 +221,7 @@ def _camera_path(
         refine_focal=cfg.calibration is None,
         reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used, first_pass.image_names),
         progress=lambda done: progress("following the camera", done, files.count),
+        facts=facts,
     )
 
 
@@ -220,14 +237,17 @@ def _use_path(files: FrameFiles, path: CameraPath) -> None:
     files.write_json(PATH_RECORD, path.record())
 
 
-def _unexplained(path: CameraPath | None, files: _Written, damaged: list[int]) -> tuple[list[int], NDArray[np.float64]]:
+def _unexplained(
+    path: CameraPath | None, files: _Written, damaged: list[int], facts: KnownFacts
+) -> tuple[list[int], NDArray[np.float64]]:
     """Damaged frames, and those without a pose or of another scene than the frames that are not damaged; and weights of
     all frames, less than 1 where smoke or blur lies on them.
     """
     whole, weights = sorted({*range(files.count)} - {*damaged}), np.ones(files.count)
     if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
         return damaged, weights
-    changes = find_changes(map(files.color, whole))
+    with frame_threads(BYTES_PER_PX * files.meta.width * files.meta.height) as pool:
+        changes = facts.find_changes(lambda: pool.map(files.color, whole), pool.map)
     weights[whole] = changes.weights
     other_scene = [whole[i] for i in changes.off_color]
     return sorted({*damaged, *(path.lost if path else []), *other_scene}), weights

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.components import runs
+from ..footage.components import Image, runs
 from ..footage.disturbances import FrameQuality, disturbances, measure_quality, scenes_outside, small_size, view_mask
 from ..footage.scenes import (
     THUMB_WIDTH,
@@ -25,10 +25,11 @@ from ..footage.scenes import (
     jumps,
     standardized,
 )
-from .source import Source, open_source, quick_images
+from .source import open_source, quick_images
 
 LOOKS, RATES = 2400, (2.0, 10.0)
 """So many images are looked at, if that is not less or more than these rates, 1/s."""
+PICTURES = 8  # of these, for the timeline
 GLIMPSES = 24  # images that show which part of the frame is the endoscope's image
 BACK_S = 3.0  # tissue is looked for in the images of so long before, s
 BACK = (1, 2, 5, 12, 28)  # how many images before; each costs a comparison of features
@@ -57,6 +58,7 @@ class Scan:
     rate: float  # looks a second, at most
     looks: list[Look]
     cuts: list[float]  # times of the first images after cuts, s
+    pictures: list[Image]  # a few small images (h, w, 3), spread over it
 
 
 def scan_video(
@@ -72,7 +74,11 @@ def scan_video(
     """
     source = open_source(video, folder_rate)
     size = small_size(source.width, source.height)
-    inside = _inside(source, size)
+    pictures = [
+        np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8)
+        for each in source.glimpses(0.0, source.seconds, GLIMPSES)
+    ]
+    inside = view_mask(pictures)
     rate = float(np.clip(LOOKS / max(source.seconds, 1e-3), *RATES))
     watch, looks, frozen = _Watch(inside, rate), list[Look](), list[float]()
     times, changes, positions = list[float](), list[float](), list[int]()  # of every image; looks before each
@@ -104,6 +110,7 @@ def scan_video(
         rate,
         _judged(looks, is_cut, connected(len(looks), watch.pairs), np.array(frozen) < FROZEN, rate),
         cuts,
+        pictures[:: max(len(pictures) // PICTURES, 1)][:PICTURES],
     )
 
 
@@ -133,11 +140,6 @@ def _judged(
         Look(look.seconds, look.quality, look.link, word, float(weight))
         for look, word, weight in zip(looks, words, weights, strict=True)
     ]
-
-
-def _inside(source: Source, size: tuple[int, int]) -> NDArray[np.bool_]:
-    images = source.glimpses(0.0, source.seconds, GLIMPSES)
-    return view_mask([np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8) for each in images])
 
 
 class _Watch:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
-from ..system.atomic import whole_file
+from ..visualization.figures import save_figure
+from .scan import PICTURES
 from .segments import WORDS, best_segment, from_json, segments_of
 from .source import open_source
 
-PICTURES = 8
 GOOD, BEST = "#8fc98f", "#2e8b57"
 COLORS: dict[str, str] = dict(
     zip(WORDS, ("#9e9e9e", "#c9a227", "#222222", "#f2d16b", "#4a78b5", "#b58ad1", "#d62728", "#e0c9c9"), strict=True)
@@ -22,14 +24,24 @@ COLORS: dict[str, str] = dict(
 CURVES = ("brightness", "contrast", "focus", "floor", "overexposed")
 
 
-def draw_scan(video: Path, scanned: dict[str, Any], path: Path, folder_rate: float = 25.0) -> None:
-    """Write the timeline of a video as a PNG file, completely or not at all. Args: scanned: what `scan.json` holds."""
+def draw_scan(
+    video: Path,
+    scanned: dict[str, Any],
+    path: Path,
+    folder_rate: float = 25.0,
+    pictures: Sequence[NDArray[np.uint8]] = (),
+) -> None:
+    """Write the timeline of a video as a PNG file, completely or not at all.
+
+    Args:
+        scanned: what `scan.json` holds. pictures: `Scan.pictures`; without them, they are read from the video.
+    """
     stretches, whole, looks = from_json(scanned), scanned["seconds"], scanned["looks"]
     # Use a canvas directly: selecting a Matplotlib backend would change the whole process.
     figure = Figure(figsize=(15, 8), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 3]).flat
-    pictures = open_source(video, folder_rate).glimpses(0.0, whole, PICTURES)
+    pictures = pictures or open_source(video, folder_rate).glimpses(0.0, whole, PICTURES)
     for axis in np.atleast_1d(top.subplots(1, PICTURES)):
         axis.set_axis_off()
     for axis, image in zip(top.axes, pictures, strict=False):
@@ -67,5 +79,4 @@ def draw_scan(video: Path, scanned: dict[str, Any], path: Path, folder_rate: flo
     motion.set_ylabel("motion, % of width")
     motion.set_xlabel("s (no point: motion unknown)")
     motion.set_xlim(0, max(whole, 1e-3))
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import spread
+from ..footage.components import InOrder
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
 
@@ -35,18 +36,24 @@ Image, Mask = NDArray[np.uint8], NDArray[np.bool_]
 
 
 def frames_with_unmasked_motion(
-    count: int, frames_per_second: float, color: Callable[[int], Image], tool: Callable[[int], Mask], view: Mask
-) -> list[int]:
+    count: int, frames_per_second: float, color: Callable[[int], Image], tool: Callable[[int], Mask], view: Mask,
+    each: InOrder = map,
+) -> list[int]:  # fmt: skip
     """Of a few frames, spread over a sequence of `count`, those of `moves_unmasked`.
 
     Args:
         color, tool: give the image (H, W, 3) of a frame, and (H, W) True on its tools.
         view: (H, W) True inside the endoscope's image.
+        each: as `map`; threads can give the results, in order.
     """
     ahead = max(1, round(MOTION_S * frames_per_second))
     compared = spread(count - ahead, COMPARED) if count > ahead else []
-    # What a tool covers or uncovers has no flow: it counts as masked where the tool is in either frame.
-    return [i for i in compared if moves_unmasked(color(i), color(i + ahead), view, (tool(i) | tool(i + ahead)) & view)]
+
+    def moves(i: int) -> bool:
+        # What a tool covers or uncovers has no flow: it counts as masked where the tool is in either frame.
+        return moves_unmasked(color(i), color(i + ahead), view, (tool(i) | tool(i + ahead)) & view)
+
+    return [i for i, found in zip(compared, each(moves, compared), strict=True) if found]
 
 
 def moves_unmasked(first: Image, later: Image, view: Mask, tool: Mask) -> bool:

@@ -167,8 +167,8 @@ class Video:
                 if found := [image for image in glimpses if image is not None]:
                     return found
         with self._open() as (container, track):
-            images = islice(decode(container, track, [], weave=True), LOOKED_AT)
             positions = {min(bisect_left(self.times, time), LOOKED_AT - 1) for time in wanted if self.times} | {0}
+            images = islice(decode(container, track, [], weave=True), max(positions) + 1)
             return [self._rgb(image, index) for index, image in enumerate(images) if index in positions]
 
     def _glimpse(self, container: InputContainer, track: VideoStream, time: float) -> NDArray[np.uint8] | None:

@@ -171,6 +171,11 @@ class StereoFrame:
     right: Image | None  # (h, w, 3); None if the video is monocular
     damaged: bool = False  # bytes of one of them, or of what it was predicted from, are missing or wrong
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that the images take."""
+        return self.left.nbytes + (0 if self.right is None else self.right.nbytes)
+
 
 class Clip:
     """Video files and their layout. `stereo_frames` can be iterated any number of times."""

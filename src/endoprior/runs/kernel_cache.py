@@ -4,7 +4,8 @@ The code that Numba compiles in a process is not always the code that it loads f
 loops are optimized once more when they are linked for the cache, and sums that may be reordered then differ in their
 last bits. A run and its repetition, or its resumed part, must not use both (docs/log.md).
 
-`python -m endoprior.runs.kernel_cache < config.json` compiles every kernel by training and scoring something tiny.
+`python -m endoprior.runs.kernel_cache < config.json` compiles every kernel by training and scoring something tiny, and
+prints how many it has compiled.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,58 +30,112 @@ from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..model.method import config_from, method_of
 from ..render import ON_GPU
+from ..system.console import say
 from ..system.file_lock import exclusive
 from ..system.surroundings import python_command
 
 PACKAGE = Path(__file__).parents[1]
+WITH_KERNELS = ("compute", "evaluation", "initialization", "model", "render", "training")
+"""The parts of the package that hold kernels, or decide with which types they are called."""
 LIMIT_S = 900.0
 """Longest time to wait, s; then, or when the process fails, kernels are compiled when they are first used."""
+USUAL_COUNT = 112
+"""Number of kernels that `default` needs, each counted with every type of its arguments; other presets differ."""
 WIDTH, HEIGHT, FRAMES = 64, 48, 10  # size of what is trained to compile, px, and its number of frames
 _filled: set[str] = set()
 
 
-def fill(cfg: Config, say: Callable[[str], None] = lambda _: None) -> None:
+def is_filled(cfg: Config) -> bool:
+    """Whether the kernels that training and scoring with `cfg` need are in Numba's cache, or cannot be there."""
+    if cfg.render.backend in ON_GPU or not method_of(cfg).has_gaussians:  # which need no Numba kernels
+        return True
+    key = _key(cfg)
+    return key in _filled or _marker(key).exists()
+
+
+def fill(
+    cfg: Config,
+    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> None:
     """Make sure that the kernels which training and scoring with `cfg` need are in Numba's cache.
 
-    `say` takes one line if they must be compiled.
+    Args:
+        say: takes one line if they must be compiled.
+        progress: is told how many are compiled, and about how many there are.
     """
-    if cfg.render.backend in ON_GPU or not method_of(cfg).has_gaussians:  # which need no Numba kernels
+    if is_filled(cfg):
         return
-    if (key := _key(cfg)) in _filled:
-        return
-    _filled.add(key)
+    _filled.add(key := _key(cfg))
+    marker = _marker(key)
     with suppress(OSError, subprocess.SubprocessError):  # a read-only folder: Numba caches nothing either
-        beside = PACKAGE / "__pycache__" if os.access(PACKAGE, os.W_OK) else Path.home() / ".cache" / "endoprior"
-        folder = Path(os.environ.get("NUMBA_CACHE_DIR") or beside)  # where Numba keeps the kernels of this package
-        marker = folder / f"endoprior_{key}.ready"
-        if marker.exists():
-            return
         marker.parent.mkdir(parents=True, exist_ok=True)
         with exclusive(marker.with_suffix(".lock"), LIMIT_S):
             if marker.exists():
                 return
             say("compiling kernels, once after installation (about a minute)")
-            config = json.dumps(to_dict(cfg))
-            words = python_command("endoprior.runs.kernel_cache")
-            done = subprocess.run(words, input=config.encode(), capture_output=True, timeout=LIMIT_S, check=False)
-            if done.returncode == 0:
+            if _compile(json.dumps(to_dict(cfg)), progress):
                 marker.touch()
 
 
+def _compile(config: str, progress: Callable[[int, int], None]) -> bool:
+    """Compile the kernels of a config in another process; whether it succeeded."""
+    words = python_command("endoprior.runs.kernel_cache")
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(words, text=True, encoding="utf-8", **pipes) as process:
+        limit = threading.Timer(LIMIT_S, process.kill)
+        limit.start()
+        try:
+            assert process.stdin is not None and process.stdout is not None
+            process.stdin.write(config)
+            process.stdin.close()
+            for line in process.stdout:
+                if line.strip().isdigit():
+                    progress(int(line), max(int(line), USUAL_COUNT))
+            return process.wait() == 0
+        except BaseException:  # an interruption: it must not compile on
+            process.kill()
+            raise
+        finally:
+            limit.cancel()
+
+
+def _marker(key: str) -> Path:
+    """The file that says that kernels are compiled, where Numba keeps those of this package."""
+    beside = PACKAGE / "__pycache__" if os.access(PACKAGE, os.W_OK) else Path.home() / ".cache" / "endoprior"
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or beside) / f"endoprior_{key}.ready"
+
+
 def _key(cfg: Config) -> str:
-    """Hash of everything that decides which kernels are needed: source, compiler, processor, parts of the config."""
+    """Hash of everything that decides which kernels are needed: source, compiler, processor, parts of the config.
+
+    Numbers of the config decide nothing, only which parts it uses: presets that differ in numbers share their kernels.
+    """
     import llvmlite.binding
     import numba
 
     digest = hashlib.sha256()
-    for file in sorted(PACKAGE.rglob("*.py")):
+    for file in sorted(file for part in WITH_KERNELS for file in (PACKAGE / part).rglob("*.py")):
         name, facts = file.relative_to(PACKAGE).as_posix(), file.stat()
         digest.update(f"{name} {facts.st_size} {facts.st_mtime_ns}".encode())
     digest.update(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version}".encode())
-    temporal = (cfg.temporal.weight > 0, cfg.temporal.gradient)
-    parts = (cfg.method, cfg.deformation, cfg.render, cfg.schedule.sh_degree, cfg.init.motion, *temporal)
-    digest.update(json.dumps([to_dict(part) for part in parts]).encode())
+    deformation = to_dict(cfg.deformation)
+    if deformation["kind"] == "hexplane":  # has a kernel for each number of planes
+        digest.update(json.dumps(deformation).encode())
+    parts = (cfg.render, {"sh_degree": cfg.schedule.sh_degree}, {"temporal": cfg.temporal.weight})
+    used = [_used(part if isinstance(part, dict) else to_dict(part)) for part in parts]
+    switches = {name: value for name, value in deformation.items() if name not in ("basis", "hexplane")}
+    words = (cfg.method, cfg.init.motion, cfg.temporal.gradient, _used(switches), used)
+    digest.update(json.dumps(words).encode())
     return digest.hexdigest()[:16]
+
+
+def _used(values: dict[str, Any]) -> dict[str, Any]:
+    """Values of a config with every number replaced by whether it is above 0."""
+    return {
+        name: value > 0 if isinstance(value, int | float) and not isinstance(value, bool) else value
+        for name, value in values.items()
+    }
 
 
 def tiny_sequence() -> FrameSequence:
@@ -111,15 +168,32 @@ def shortened(cfg: Config) -> Config:
 
 
 def main() -> None:
-    """Read the config, train, score."""
+    """Read the config, train, score; print a count after each kernel."""
+    from numba.core import event
+
     from ..evaluation.scoring import evaluate  # which takes long to import
 
+    class Counting(event.Listener):
+        """Prints how many kernels have been compiled so far."""
+
+        def __init__(self) -> None:
+            self.count = 0
+
+        def on_start(self, _event: event.Event) -> None:
+            """A kernel begins."""
+
+        def on_end(self, _event: event.Event) -> None:
+            """A kernel is there."""
+            self.count += 1
+            say(str(self.count))
+
     cfg, sequence = shortened(config_from(json.load(sys.stdin))), tiny_sequence()
-    trainer = method_of(cfg).trainer(sequence, cfg)
-    trainer.start()
-    while not trainer.finished:
-        trainer.step()
-    evaluate(trainer.scene(), sequence, networks=False)
+    with event.install_listener("numba:compile", Counting()):
+        trainer = method_of(cfg).trainer(sequence, cfg)
+        trainer.start()
+        while not trainer.finished:
+            trainer.step()
+        evaluate(trainer.scene(), sequence, networks=False)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from ..data import FrameSequence
 from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
-from ..system.atomic import whole_file
+from ..visualization.figures import save_figure
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span, tissue_distance, turned
 from ..visualization.tissue_layers import PaintedTissue, SupportMap
@@ -60,8 +60,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     _plot_loss(loss_axis, log)
     _plot_psnr(psnr_axis, per_frame)
     _write_scores(table_axis, metrics, sequence.depth_is_relative)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:

@@ -126,8 +126,9 @@ def start_run(
         reject_unextendable(Path(out), cfg, len(sequence))
     if cfg.windows.longest:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
-        whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
-        plan = plan_windows(cameras, look_through(whole), cfg.windows.longest)
+        # Else looked at through a view with a cache of its own, which is freed.
+        looks = sequence.looks or look_through(sequence.part(0, len(sequence)))
+        plan = plan_windows(cameras, looks, cfg.windows.longest)
         if len(plan) > 1 and not method_of(cfg).has_gaussians:
             want, got = f"0 with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
             raise input_error("windows.longest", want, got, "Add --windows.longest 0.")

@@ -10,8 +10,8 @@ from ...model.playback import Playback
 from ...model.scene import RenderedScene, Scene
 from ...model.single_scene import SingleScene
 from ...system.devices import wait_for
-from ..context import EvaluationContext
-from ..score import scores_from
+from ..context import SPEED_OFF, EvaluationContext
+from ..score import ScoreUnavailable, scores_from
 
 LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 40.0  # The paper's thresholds
 FPS_WARM_UP, FPS_RENDERS = 10, 60
@@ -47,6 +47,8 @@ def compute(context: EvaluationContext) -> None:
         for name, count in counts.items():
             context.add(name, count)
     with context.skip_if_unavailable("fps", "fps_cached"):
+        if not context.speed:
+            raise ScoreUnavailable(SPEED_OFF)
         context.add("fps", frames_per_second(context.rendered_scene))
         context.add("fps_cached", frames_per_second(context.scene, cached=True))
 

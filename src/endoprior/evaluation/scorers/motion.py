@@ -21,6 +21,7 @@ from ...core.types import Frame
 from ...footage.components import Image, Mask
 from ...footage.optical_flow import MIN_SIZE_PX, dense_flow, gray_for_flow
 from ...model.colors import changes_color, with_fixed_color
+from ...system.parallel import frame_threads
 from ..context import NETWORKS_OFF, EvaluationContext, SceneFrames
 from ..networks import RAFT_LARGE, RAFT_SMALL, find_weights, import_torchvision, select_weights
 from ..score import ScoreUnavailable, scores_from
@@ -28,6 +29,7 @@ from ..score import ScoreUnavailable, scores_from
 if TYPE_CHECKING:
     from torch.nn import Module
 
+BYTES_PER_PX = 120  # memory in which a thread compares two flows, bytes for each px
 RAFT_UPDATES = 12  # Refinements of RAFT's flow; the last one is used, as published
 RAFT_SIDE_MULTIPLE, RAFT_MIN_SIZE = 8, 128
 """Sides are padded to multiples of the first, px; below the second RAFT's coarsest level has no pixel left."""
@@ -69,10 +71,17 @@ def _add(context: EvaluationContext, name: str, frames: Sequence[Frame], estimat
     """Add the mean error over pairs of neighbors in `frames`: over a test split they are 8 frames apart, as published.
     In `per_frame` a pair of the split stands at its first frame.
     """
-    errors: list[float] = []
-    for pair in pairwise(frames):
-        rendered, true = [context.rendered[frame.index].rgb_u8 for frame in pair], [frame.rgb_u8 for frame in pair]
-        errors.append(flow_error(rendered, true, [frame.tissue_mask for frame in pair], estimator))
+
+    def error(pair: tuple[list[Frame], list[Image]]) -> float:
+        frames, rendered = pair
+        return flow_error(rendered, [each.rgb_u8 for each in frames], [each.tissue_mask for each in frames], estimator)
+
+    pairs = (([*pair], [context.rendered[frame.index].rgb_u8 for frame in pair]) for pair in pairwise(frames))
+    if estimator is dis_flow:
+        with frame_threads(BYTES_PER_PX * frames[0].tissue_mask.size if frames else 1) as pool:
+            errors = list(pool.map(error, pairs))
+    else:  # a network computes with all threads
+        errors = list(map(error, pairs))
     reason = "no two neighboring frames share tissue"
     if frames is context.frames:
         context.add_frames([{name: error} for error in (*errors, math.nan)], reason)

@@ -22,6 +22,7 @@ from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
+from ...system.parallel import frame_threads
 from ..context import EvaluationContext
 from ..score import ScoreUnavailable, scores_from
 from .image import psnr_tissue
@@ -38,6 +39,7 @@ SCORES = scores_from("""
     depth_relief | depth relief against triangulation |  | higher | 2 | relative | depth | -
         Correlation, within a frame, of the logarithms of rendered and triangulated depth; flat depth has none.
 """)
+BYTES_PER_PX = 60  # memory in which a thread follows a frame, bytes for each px
 MEAN_FRAMES = 60  # training frames in the mean image
 STARTS, AHEAD, GRID = 6, 12, 16
 """Frames from which points are followed, for so many frames, and the number of points along the wider side."""
@@ -68,14 +70,14 @@ def _image_references(context: EvaluationContext) -> None:
     if not len(training):
         raise ScoreUnavailable("there is no training frame")
     average = mean_image(training)
-    for frame in context.frames:
-        mask, row = frame.tissue_mask, dict[str, float]()
-        image, (moved, known) = context.rendered[frame.index].rgb, moved_frame(training, frame)
-        row["gain_over_flow"] = psnr_tissue(image, frame.rgb, mask & known) - psnr_tissue(
-            moved, frame.rgb, mask & known
-        )
-        row["gain_over_mean"] = psnr_tissue(image, frame.rgb, mask) - psnr_tissue(average, frame.rgb, mask)
-        rows.append(row)
+    with frame_threads(BYTES_PER_PX * average.size) as pool:
+        moves = pool.map(lambda frame: moved_frame(training, frame), context.frames)
+        for frame, (moved, known) in zip(context.frames, moves, strict=True):
+            image, true, mask = context.rendered[frame.index].rgb, frame.rgb, frame.tissue_mask
+            here = psnr_tissue(image, true, mask & known), psnr_tissue(moved, true, mask & known)
+            everywhere = psnr_tissue(image, true, mask), psnr_tissue(average, true, mask)
+            gains = (ours - other for ours, other in (here, everywhere))
+            rows.append(dict(zip(("gain_over_flow", "gain_over_mean"), gains, strict=True)))
     context.add_frames(rows, "no tissue in the split")
 
 
@@ -119,8 +121,10 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
     sequence = context.sequence
     ahead = min(AHEAD, len(sequence) - 1)
     slips, errors, reliefs, tried = list[NDArray](), list[NDArray](), list[NDArray](), 0
-    for k in spread(len(sequence) - ahead, STARTS):
-        followed = follow(sequence, k, ahead)
+    starts = spread(len(sequence) - ahead, STARTS)
+    with frame_threads(BYTES_PER_PX * sequence.frame(0).tissue_mask.size) as pool:
+        paths = list(pool.map(lambda k: follow(sequence, k, ahead), starts))
+    for k, followed in zip(starts, paths, strict=True):
         tried += followed.tried
         if not len(followed.start):
             continue

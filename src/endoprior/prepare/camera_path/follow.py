@@ -1,7 +1,7 @@
 """Follow the camera through a clip: tracks from frame to frame, a pose each, keyframes, and the way back after a loss.
 
 A loss starts a new segment with a world of its own. A segment whose keyframe is recognized in another one moves into
-its world (relocalization), with the scale of its depth if that is relative. Only two frames are in memory at a time.
+its world (relocalization), with the scale of its depth if that is relative. Only a few frames are in memory at a time.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.ranges import spread
+from ...system.parallel import frame_threads
 from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
 from .features import Keyframe, Link, View, followed, followed_directly, keyframe, link, new_corners, sampled, view_of
 from .tracks import Lens, PoseInput, Tracks
 
+BYTES_PER_PX = 60  # memory in which a thread prepares a frame, bytes for each px of a square one
 MIN_TRACKS = 30  # with fewer tracks a frame gets no pose from the frame before
 MIN_INLIERS = 0.4
 """Share of the tracks that one pose must explain; below, the frame shows another place or another scene."""
@@ -40,9 +42,9 @@ class Follower:
         self._view: View | None = None
         self._at_keyframe = self._ids, self._pixels
 
-    def follow(self, index: int, seen: PoseInput) -> None:
+    def follow(self, index: int, view: View) -> None:
         """Add the next frame."""
-        view, before, lost = view_of(seen, coarse=self.few_corners), self._view, True
+        before, lost = self._view, True
         depths, follow = np.zeros(0, np.float32), followed_directly if self.few_corners else followed
         if before is not None and (found := follow(before, view, self._pixels)) is not None:
             kept, pixels = found
@@ -185,7 +187,8 @@ def follow_camera(
 ) -> Follower:  # fmt: skip
     """Follow the camera through frames 0..count-1, each read once, in order."""
     follower = Follower(lens, count, few_corners=few_corners)
-    for index in range(count):
-        follower.follow(index, frame(index))
-        progress(index + 1)
+    with frame_threads(BYTES_PER_PX * lens.width**2) as pool:
+        for index, view in enumerate(pool.map(lambda i: view_of(frame(i), coarse=few_corners), range(count))):
+            follower.follow(index, view)
+            progress(index + 1)
     return follower

@@ -19,8 +19,10 @@ from ...core.geometry import Convention, length_unit, to_ours
 from ...core.ranges import spread
 from ...core.shell import install_command
 from ...data.writer import FARTHEST_UNIT
-from ...footage.camera_motion import SHOWN, CameraMotion, camera_motion
+from ...footage.camera_motion import SHOWN, CameraMotion
+from ...footage.known_facts import KnownFacts
 from ...footage.pose_fit import View, measure_poses
+from ...system.parallel import frame_threads
 from .adjust import Observations, adjust, back_projected, residuals
 from .colmap import LONGEST, colmap_path, is_installed, with_poses
 from .follow import Follower, follow_camera
@@ -31,6 +33,7 @@ from .shape import DepthShape, axial_cosine, fitted_shape
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
 from .tube import shape_by_light
 
+BYTES_PER_PX = 60  # memory in which a thread compares two frames, bytes for each px
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
 NEGLIGIBLE_DEGREES = 1e-3
 PATH_RECORD = "camera_path.json"  # in a sequence folder: how each pose was found, and how sure it is
@@ -92,6 +95,7 @@ def sequence_path(
     refine_focal: bool,
     reading: Reading = AS_OURS,
     progress: Callable[[int], None] = lambda _done: None,
+    facts: KnownFacts | None = None,
 ) -> tuple[CameraPath | None, list[str]]:
     """The path, None for a static camera; and notes for the user.
 
@@ -102,6 +106,7 @@ def sequence_path(
         lens: its focal length may be an assumption: `refine_focal`.
         size: (width, height), px.
         reading: how the matrices of a file are to be read, and what they belong to.
+        facts: gets the motion of the image as a whole.
     Raises:
         InputError: the file of poses cannot be used, or COLMAP is asked for and not there.
     """
@@ -112,7 +117,9 @@ def sequence_path(
         raise input_error("--poses-convention", "a file with --poses", got, fix)
     if how == "still":
         return None, []
-    motion = camera_motion(*views())
+    facts = facts or KnownFacts()
+    with frame_threads(BYTES_PER_PX * size[0] * size[1]) as pool:
+        motion = facts.camera_motion(lambda: views()[0], lambda: views()[1], pool.map)
     if how in ONLY_IF_MOVING and motion.kind == "static":
         return None, [motion.text]
     if not has_depth:
