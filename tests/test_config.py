@@ -96,12 +96,12 @@ def test_only_tuples_lists_and_plain_values_are_configured():
 
 def test_basis_functions_follow_the_length_of_the_sequence():
     fitted = [BasisConfig().fitted(n) for n in (2, 5, 24, 48, 63, 156)]
-    assert [basis.num_bases for basis in fitted] == [4, 5, 13, 22, 28, 65]
-    assert [basis.num_change_bases for basis in fitted] == [4, 4, 8, 12, 15, 32]
+    assert [basis.num_bases for basis in fitted] == [4, 5, 15, 27, 35, 81]
+    assert [basis.num_change_bases for basis in fitted] == [4, 4, 7, 12, 15, 32]
     assert [basis.num_frames for basis in fitted] == [2, 5, 24, 48, 63, 156]
     assert BasisConfig(num_bases=31).fitted(24) == BasisConfig(31, 24)
     fitted = preset("default").fitted(48)
-    assert fitted.deformation.basis.num_bases == 22 and fitted.fitted(99) == fitted
+    assert fitted.deformation.basis.num_bases == 27 and fitted.fitted(99) == fitted
     with pytest.raises(ValueError, match="num_bases: expected at least 4"):
         temporal_shapes(preset("default"))
 
@@ -161,10 +161,10 @@ def test_another_length_keeps_the_shares_of_the_schedule():
     assert (short.density.start_iteration, short.temporal.start_iteration, short.density.stop_iteration) == (
         167,
         167,
-        5000,
+        6250,
     )
     assert short.optim.decay_iterations == 500 and short.density.every == cfg.density.every
-    assert cfg.replace({"iterations": "x2"}) == preset("default", iterations=3000)
+    assert cfg.replace({"iterations": "x2"}) == preset("default", iterations=2400)
     assert short.replace({"iterations": 1}).schedule.half_resolution_iterations == 1  # 0 would mean never
     assert preset("best", iterations=1500).optim.decay_iterations == 1500
     mine = cfg.replace({"optim.decay_iterations": 900, "iterations": 500})
@@ -225,6 +225,16 @@ def leaves(values, prefix=""):
 
 FORMER = json.loads((Path(__file__).parent / "former_configs.json").read_text())
 """What the version before stored of each preset: 141 fields, as nested dicts, only where they differ from `paper`."""
+SCHEDULE = (
+    "schedule.fine_iterations", "optim.decay_iterations", "schedule.half_resolution_iterations",
+    "density.start_iteration", "temporal.start_iteration",
+)  # fmt: skip
+FORMER_SCHEDULES = {
+    "default": (1500, 1500, 500, 500, 500),
+    "best": (3000, 3000, 800, 500, 500),
+    "preview": (500, 500, 170, 170, 170),
+}
+FORMER_RATES = {"optim.means_lr": 5e-3, "optim.basis_lr": 0.01, "optim.scales_lr": 0.02, "optim.quats_lr": 0.01}
 
 
 def former(name: str) -> dict:
@@ -249,8 +259,9 @@ def test_what_the_version_before_stored_is_the_preset_of_today(name, told):
     stored = former(name)
     assert len(dict(leaves(stored))) == 141
     since = {"endogaussian": {"init.budget": 20_000}, "endo4dgs": {"render.depth_grad_to_means": False}}
-    basis_lr = {"optim.basis_lr": 0.01} if name in ("default", "best", "preview") else {}
-    former_values = {"render.photometric": "none"} | basis_lr | since.get(name, {})
+    if name in FORMER_SCHEDULES:
+        since[name] = FORMER_RATES | dict(zip(SCHEDULE, FORMER_SCHEDULES[name], strict=True))
+    former_values = {"render.photometric": "none"} | since.get(name, {})
     assert config_from(stored) == config_from(stored) == preset(name, **former_values)
     assert told() == (
         "endoprior: stored config: 80 of its fields are constants of this version, with the same values\n"

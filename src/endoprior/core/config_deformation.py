@@ -8,9 +8,9 @@ from typing import Annotated, ClassVar, Literal
 from .checks import check_range
 from .ranges import Checked, Count, Range
 
-FRAMES_PER_SPAN = 2.5
+FRAMES_PER_SPAN = 2.0
 """Frames between two knots of the splines of displacement. With 1.8 held-out frames follow worse where tissue rests."""
-CHANGE_SPANS = 0.46
+CHANGE_SPANS = 0.37
 """Spans of the splines of rotation, scale and color, which change more slowly, for each span of displacement."""
 DEGREE = 3  # of the splines: one with K spans between knots has K + DEGREE functions
 FEWEST_BASES, MOST_BASES = DEGREE + 1, 1000
@@ -50,8 +50,8 @@ class BasisConfig(Checked):
     """Coefficients of each Gaussian for cubic B-splines over time: a linear map, no network."""
 
     num_bases: Annotated[int, Range(0, MOST_BASES)] = 0
-    """Spline functions of the displacement; rotation, scale and color have about half as many. More follow faster
-    motion, and frames that were not trained on less well; 0 takes one for every 2.5 frames, and 3."""
+    """Spline functions of the displacement; rotation, scale and color have about 0.4 as many. More follow faster
+    motion, and frames that were not trained on less well; 0 takes one for every 2 frames, and 3."""
     num_frames: Count = 0
     """Frames with a displacement of their own beside the spline, which optical flow gives; 0 takes all."""
 

@@ -33,7 +33,7 @@ def default() -> Config:
 
     The paper's prior, and motion as temporal coefficients of each Gaussian, seeded by flow.
 
-    Its rates suit 1,500 iterations: those of 3DGS are meant for twenty times as many.
+    Its rates suit 1,200 iterations: those of 3DGS are meant for twenty times as many.
     """
     return Config()
 
@@ -65,7 +65,7 @@ def paper() -> Config:
             trust_masks=True,
         ),
         temporal=replace(base.temporal, start_iteration=1000, min_valid=20, gradient="both"),
-        density=replace(base.density, grow_threshold=2e-4),
+        density=replace(base.density, grow_threshold=2e-4, start_iteration=500),
         optim=replace(
             base.optim, means_lr=1.6e-4, scales_lr=5e-3, quats_lr=1e-3, decay_iterations=4000, late_decay=1.0
         ),
@@ -117,8 +117,8 @@ def best() -> Config:
         base,
         init=replace(base.init, budget=50_000),
         density=replace(base.density, grow_threshold=2e-4),
-        optim=replace(base.optim, decay_iterations=3000),
-        schedule=replace(base.schedule, fine_iterations=3000, half_resolution_iterations=800),
+        optim=replace(base.optim, decay_iterations=2400),
+        schedule=replace(base.schedule, fine_iterations=2400, half_resolution_iterations=640),
     )
 
 
@@ -128,10 +128,10 @@ def preview() -> Config:
     return replace(
         base,
         init=replace(base.init, budget=10_000),
-        temporal=replace(base.temporal, start_iteration=170),
-        density=replace(base.density, start_iteration=170),
-        optim=replace(base.optim, decay_iterations=500),
-        schedule=replace(base.schedule, fine_iterations=500, half_resolution_iterations=170),
+        temporal=replace(base.temporal, start_iteration=140),
+        density=replace(base.density, start_iteration=140),
+        optim=replace(base.optim, decay_iterations=400),
+        schedule=replace(base.schedule, fine_iterations=400, half_resolution_iterations=140),
     )
 
 
