@@ -209,6 +209,13 @@ def test_descriptions_that_do_not_fit(scene_file, path, monkeypatch):
         complaint(path, name)
 
 
+def test_a_scene_of_an_earlier_version_is_named_as_such(scene_file, path):
+    scene = copy_of(scene_file)
+    del scene.about["config"]["deformation"]["basis"]["num_frames"]
+    scene.write(path)
+    assert "radial basis functions, of an earlier version" in complaint(path, "earlier version")
+
+
 def set_entry(name, index, value):
     """Change one number."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from ..core.checks import input_error
-from ..core.config import Config
+from ..core.config import OWN, Config
 from ..core.config_io import from_dict
 from ..core.geometry import FARTHEST_MM
 from ..core.shell import command
@@ -69,6 +69,9 @@ def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
 def _config(about: dict[str, Any]) -> Config:
     """What a scene was trained with; one of both eyes from before there was gloss is as one of the left eye."""
     cfg = config_from(about["config"])
+    if cfg.method == OWN and cfg.deformation.kind == "basis" and not cfg.deformation.basis.num_frames:
+        want, got = "splines over time", "radial basis functions, of an earlier version"
+        raise input_error("config.deformation.basis", want, got, "Render it with that version, or train again.")
     of_one = about["format"] == FORMAT and not about.get("baseline_mm")
     return replace(cfg, data=replace(cfg.data, eyes="left")) if of_one else cfg
 
