@@ -30,6 +30,8 @@ RATES = {
     "box": 1.6e-3,
 }
 """Initial rates that no config sets: those of 3DGS, and of EndoGaussian's planes and box."""
+SHORT_RATES = RATES | {"sh_dc": 4e-3, "color_slopes": 4e-3, "opacity_logits": 8e-2}
+"""Those of schedules that are not published ones: ours have a twentieth of the iterations."""
 NETWORK_LR = 1.6e-4  # initial rate of trunk and heads (EndoGaussian)
 FINAL_SHARE = 0.01  # of the rates of centers, network and planes, left at `decay_iterations`; log-linear in between
 BASIS_OPACITY_LR = 2e-2  # rate of the temporal coefficients of opacities
@@ -64,7 +66,7 @@ def rate_of(name: str, cfg: Config, spatial_scale: float) -> Rate:
     """
     optim = cfg.optim
     of_config = {"means": optim.means_lr, "quats": optim.quats_lr, "log_scales": optim.scales_lr}
-    start = (of_config | RATES).get(name, NETWORK_LR)
+    start = (of_config | (RATES if cfg.schedule.literal else SHORT_RATES)).get(name, NETWORK_LR)
     if name in {a.name for a in ATTRIBUTES} - {"means"}:
         return lambda iteration: start * late_share(optim, iteration)
     return lambda iteration: spatial_scale * log_linear(start, FINAL_SHARE * start, iteration, optim.decay_iterations)
