@@ -161,10 +161,10 @@ def test_another_length_keeps_the_shares_of_the_schedule():
     assert (short.density.start_iteration, short.temporal.start_iteration, short.density.stop_iteration) == (
         167,
         167,
-        6250,
+        5556,
     )
     assert short.optim.decay_iterations == 500 and short.density.every == cfg.density.every
-    assert cfg.replace({"iterations": "x2"}) == preset("default", iterations=2400)
+    assert cfg.replace({"iterations": "x2"}) == preset("default", iterations=2700)
     assert short.replace({"iterations": 1}).schedule.half_resolution_iterations == 1  # 0 would mean never
     assert preset("best", iterations=1500).optim.decay_iterations == 1500
     mine = cfg.replace({"optim.decay_iterations": 900, "iterations": 500})

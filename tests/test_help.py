@@ -93,7 +93,7 @@ def test_optional_arguments_stand_in_brackets(command, usage, printed):
 def test_defaults_are_those_of_the_preset(printed):
     pages = [printed("train", "--preset", name, "--help") for name in ("default", "paper")]
     iterations = [re.search(r"--iterations INT .*\(default: (\d+)\)", page)[1] for page in pages]
-    assert iterations == ["1200", "4000"]
+    assert iterations == ["1350", "4000"]
     assert "--no-networks" in pages[0] and "Switch off: " in pages[0]
 
 

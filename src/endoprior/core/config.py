@@ -124,7 +124,7 @@ class TemporalConfig(Checked):
 
     weight: Weight = 1e-6
     """lambda_local, per mm: higher makes neighbors move more alike; 0 switches the term off."""
-    start_iteration: Count = 400
+    start_iteration: Count = 450
     """First fine iteration with the term."""
     without: Literal["nothing", "pair_weights", "distance"] = "nothing"
     """Part that is left out, as in the paper's ablation: the weights of pairs, or the term of their distances."""
@@ -141,7 +141,7 @@ class TemporalConfig(Checked):
 class DensityConfig(Checked):
     """Growth and pruning, Eqs. (7)-(8) and the rule after them."""
 
-    start_iteration: Count = 400
+    start_iteration: Count = 450
     """Gaussians are cloned, split and removed after this iteration of a stage ..."""
     every: Annotated[int, Range(1, 1_000_000)] = 100
     """... at multiples of this one ..."""
@@ -178,7 +178,7 @@ class OptimConfig(Checked):
     """Rate of the log scales."""
     quats_lr: Rate = 2e-2
     """Rate of the rotations."""
-    decay_iterations: Positive = 1200
+    decay_iterations: Positive = 1350
     """Iterations, counted in each stage, over which rates decay: the number of fine iterations, or a little more."""
     late_decay: DecayedRate = 0.1
     """Share of the rates of scales, rotations, opacities and colors that is left at `decay_iterations`: they are
@@ -191,11 +191,11 @@ class ScheduleConfig(Checked):
 
     coarse_iterations: Count = 0
     """Stage one: the first training frame alone, no deformation. 0 leaves the stage out."""
-    fine_iterations: Positive = 1200
+    fine_iterations: Positive = 1350
     """Training iterations. Stage two: a random training frame each time, deformed. More is better, and takes longer."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Highest degree of the color's spherical harmonics: above 0 color depends on the direction of view."""
-    half_resolution_iterations: Count = 400
+    half_resolution_iterations: Count = 450
     """Fine iterations, from the first on, that use frames of half the width and height: more is faster, less sharp."""
     sh_every: Positive = 500
     """The degree in use rises by one each time this many iterations of a stage have passed."""

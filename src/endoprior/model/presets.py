@@ -33,7 +33,7 @@ def default() -> Config:
 
     The paper's prior, and motion as temporal coefficients of each Gaussian, seeded by flow.
 
-    Its rates suit 1,200 iterations: those of 3DGS are meant for twenty times as many.
+    Its rates suit 1,350 iterations: those of 3DGS are meant for twenty times as many.
     """
     return Config()
 
@@ -117,8 +117,8 @@ def best() -> Config:
         base,
         init=replace(base.init, budget=50_000),
         density=replace(base.density, grow_threshold=2e-4),
-        optim=replace(base.optim, decay_iterations=2400),
-        schedule=replace(base.schedule, fine_iterations=2400, half_resolution_iterations=640),
+        optim=replace(base.optim, decay_iterations=2700),
+        schedule=replace(base.schedule, fine_iterations=2700, half_resolution_iterations=720),
     )
 
 
@@ -128,10 +128,10 @@ def preview() -> Config:
     return replace(
         base,
         init=replace(base.init, budget=10_000),
-        temporal=replace(base.temporal, start_iteration=140),
-        density=replace(base.density, start_iteration=140),
-        optim=replace(base.optim, decay_iterations=400),
-        schedule=replace(base.schedule, fine_iterations=400, half_resolution_iterations=140),
+        temporal=replace(base.temporal, start_iteration=150),
+        density=replace(base.density, start_iteration=150),
+        optim=replace(base.optim, decay_iterations=450),
+        schedule=replace(base.schedule, fine_iterations=450, half_resolution_iterations=150),
     )
 
 
