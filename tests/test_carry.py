@@ -25,6 +25,7 @@ def still_scene():
     scene = moving_scene()
     with torch.no_grad():
         scene.gaussians["motion"].zero_()
+        scene.gaussians["frame_motion"].zero_()
     return scene
 
 

@@ -216,7 +216,7 @@ def test_layout_of_changes_follows_the_configuration() -> None:
     assert change_layout(BASIS) == {"quats": slice(0, 4), "log_scales": slice(4, 7), "sh_dc": slice(7, 10)}
     rigid = BASIS.replace({"deformation.deform_shape": False, "deformation.deform_opacity": True})
     assert change_layout(rigid) == {"opacity_logits": slice(0, 1), "sh_dc": slice(1, 4)}
-    assert temporal_shapes(rigid) == {"motion": (9, 3), "changes": (6, 4), "frame_motion": (12, 3)}
+    assert temporal_shapes(rigid) == {"motion": (9, 3), "changes": (5, 4), "frame_motion": (12, 3)}
     both = rigid.replace({"data.eyes": "both"})
     assert change_layout(both) == change_layout(rigid) | {"gloss": slice(4, 7)}
 
@@ -233,7 +233,7 @@ def coefficients(num: int, cfg: Config, dtype: torch.dtype = torch.float32) -> d
 def test_basis_by_its_definition(time: float) -> None:
     cfg = BASIS.replace({"deformation.deform_opacity": True, "data.eyes": "both"})
     tensors = coefficients(300, cfg)
-    weights = {name: reference_basis.spline_weights(time, n) for name, n in (("motion", 9), ("changes", 6))}
+    weights = {name: reference_basis.spline_weights(time, n) for name, n in (("motion", 9), ("changes", 5))}
     weights["frame_motion"] = reference_basis.frame_weights(time, 12)
     for name, values in basis_weights(time, cfg.deformation.basis).items():
         np.testing.assert_allclose(values, weights[name], atol=1e-12)

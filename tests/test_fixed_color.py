@@ -34,7 +34,7 @@ def wall(shift_mm: float = 0.0, shade: float = 0.0) -> Scene:
     It reaches 30 px beyond the image. Nothing moves or changes at time 0.
     """
     cfg = preset("default").fitted(20)
-    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=BasisConfig(9, NUM_FRAMES)))
+    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=BasisConfig(12, NUM_FRAMES)))
     x, y = np.meshgrid(np.arange(-30, WIDTH + 30) + 0.5, np.arange(-30, HEIGHT + 30) + 0.5)
     pixels = np.column_stack([x.ravel(), y.ravel()])
     points = back_project(pixels, np.full(len(pixels), DEPTH), CAMERA).astype(np.float32)
@@ -42,11 +42,11 @@ def wall(shift_mm: float = 0.0, shade: float = 0.0) -> Scene:
     colors = np.repeat(rng.uniform(0.3, 0.5, (len(points), 1)), 3, 1)
     scales = np.full(len(points), np.log(0.4 * DEPTH / FOCAL), np.float32)
     gaussians = create_gaussians(points, colors.astype(np.float32), scales, cfg)
-    # Functions 4 of 9 and 3 of 6 have a weight in the middle and none at the start.
-    moves, shines = spline_weights(MIDDLE / NUM_FRAMES, 9)[4], spline_weights(MIDDLE / NUM_FRAMES, 6)[3]
+    # Functions 5 of 12 and 3 of 6 have a weight in the middle and none at the start.
+    moves, shines = spline_weights(MIDDLE / NUM_FRAMES, 12)[5], spline_weights(MIDDLE / NUM_FRAMES, 6)[3]
     with torch.no_grad():
         gaussians["opacity_logits"].fill_(6.0)
-        gaussians["motion"][:, 4, 0] = shift_mm / moves
+        gaussians["motion"][:, 5, 0] = shift_mm / moves
         shades = torch.from_numpy(shade * rng.uniform(0, 1, (len(points), 1)) / shines)
         gaussians["changes"][:, 3, change_layout(cfg)["sh_dc"]] = shades.float()
     num = len(points)
@@ -108,7 +108,7 @@ def test_what_the_first_frame_hides_is_not_painted():
     front = slice(len(scene), None)
     tensors["means"], tensors["motion"] = tensors["means"].detach(), tensors["motion"].detach()
     tensors["means"][front] *= 0.8
-    tensors["motion"][front, 4, 0] = 100
+    tensors["motion"][front, 5, 0] = 100
     blue = painted(replace(scene, gaussians=Gaussians(tensors)), MIDDLE)
     assert np.abs(blue[:, 64:96]).max() < 1e-3 and blue[:, 4:56].max() > 0.1
 

@@ -28,7 +28,7 @@ TISSUE = np.array([0.6, 0.25, 0.2], np.float32)
 def wall(shine: Callable[[np.ndarray], np.ndarray]) -> Scene:
     """A red plane with a Gaussian for every second px; `shine` of the pixels (N, 2) says how white they are, (N, B)."""
     cfg = preset("default").fitted(NUM_FRAMES)
-    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=BasisConfig(33, NUM_FRAMES)))
+    cfg = replace(cfg, deformation=replace(cfg.deformation, basis=BasisConfig(41, NUM_FRAMES)))
     x, y = np.meshgrid(np.arange(-8, WIDTH + 8, 2) + 0.5, np.arange(-8, HEIGHT + 8, 2) + 0.5)
     pixels = np.column_stack([x.ravel(), y.ravel()])
     points = back_project(pixels, np.full(len(pixels), 60.0), CAMERA).astype(np.float32)

@@ -94,7 +94,7 @@ def test_methods_that_take_weeks_run_only_if_they_are_named():
 def test_an_estimate_counts_each_part_of_a_schedule(tmp_path):
     cfg = preset("paper")
     assert parts_of(cfg) == (1000, 0, 1000, 2000) and parts_of(preset("endogaussian")) == (1000, 0, 3000, 0)
-    assert parts_of(preset("default")) == (0, 500, 0, 1000)
+    assert parts_of(preset("default")) == (0, 450, 0, 900)
     short = cfg.replace(shortened(cfg))
     parts = parts_of(short)
     assert parts == (30, 0, 30, 30)

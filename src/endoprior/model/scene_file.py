@@ -69,7 +69,8 @@ def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
 def _config(about: dict[str, Any]) -> Config:
     """What a scene was trained with; one of both eyes from before there was gloss is as one of the left eye."""
     cfg = config_from(about["config"])
-    if cfg.method == OWN and cfg.deformation.kind == "basis" and not cfg.deformation.basis.num_frames:
+    of_windows, deformation = about["format"] == windowed_scene.FORMAT, cfg.deformation
+    if cfg.method == OWN and deformation.kind == "basis" and not deformation.basis.num_frames and not of_windows:
         want, got = "splines over time", "radial basis functions, of an earlier version"
         raise input_error("config.deformation.basis", want, got, "Render it with that version, or train again.")
     of_one = about["format"] == FORMAT and not about.get("baseline_mm")
