@@ -128,10 +128,10 @@ def preview() -> Config:
     return replace(
         base,
         init=replace(base.init, budget=10_000),
-        temporal=replace(base.temporal, start_iteration=150),
-        density=replace(base.density, start_iteration=150),
-        optim=replace(base.optim, decay_iterations=450),
-        schedule=replace(base.schedule, fine_iterations=450, half_resolution_iterations=150),
+        temporal=replace(base.temporal, start_iteration=170),
+        density=replace(base.density, start_iteration=170),
+        optim=replace(base.optim, decay_iterations=500),
+        schedule=replace(base.schedule, fine_iterations=500, half_resolution_iterations=170),
     )
 
 
