@@ -12,14 +12,14 @@ import torch
 
 from endoprior.compute.relu_network import relu_network, relu_network_torch
 from endoprior.core.config_deformation import DeformationConfig
-from endoprior.model.basis import basis_offsets
+from endoprior.model.basis import TRAINED, basis_offsets
 from endoprior.model.gaussians import temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.motion import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
-from endoprior.training.optimizer import TEMPORAL, Optimizer, rate_of, temporal_rates
+from endoprior.training.optimizer import Optimizer, rate_of, temporal_rates
 from endoprior.training.temporal import MOST_POINTS
 from endoprior_baselines.surgicalgaussian import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
@@ -73,7 +73,7 @@ def basis(num: int, ops: TrainingOps) -> common.Steps:
     """Offsets from temporal coefficients, their gradient and their Adam step."""
     cfg = preset("default").fitted(68)
     tensors = {n: torch.zeros(num, *shape, requires_grad=True) for n, shape in temporal_shapes(cfg).items()}
-    states = {n: AdamState(tensors[n], tensors[n].shape[1]) for n in TEMPORAL}
+    states = {n: AdamState(tensors[n], tensors[n].shape[1]) for n in TRAINED}
     sink: list[RankOneGradient] = []
 
     def backward(offsets: object) -> None:

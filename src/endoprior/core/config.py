@@ -192,7 +192,7 @@ class ScheduleConfig(Checked):
     coarse_iterations: Count = 0
     """Stage one: the first training frame alone, no deformation. 0 leaves the stage out."""
     fine_iterations: Positive = 1350
-    """Training iterations. Stage two: a random training frame each time, deformed. More is better, and takes longer."""
+    """Training iterations. Stage two: one training frame each time, deformed. More is better, and takes longer."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Highest degree of the color's spherical harmonics: above 0 color depends on the direction of view."""
     half_resolution_iterations: Count = 450

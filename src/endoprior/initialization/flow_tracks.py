@@ -50,11 +50,11 @@ log = logging.getLogger(__name__)
 
 
 def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> InitialMotion:
-    """Temporal coefficients that move every point of the cloud along its track; 0 in frames too small for optical flow.
+    """How every point of the cloud moves along its track; not at all in frames too small for optical flow.
 
     Args:
         frames: T training frames (never test frames), in order.
-        cloud: points with their source frames.
+        cloud: N points with their source frames. cfg: how many spline functions there are.
     """
     height, width = frames[0].tissue_mask.shape
     if min(height, width) < MIN_SIZE_PX:

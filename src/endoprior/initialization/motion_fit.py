@@ -37,8 +37,8 @@ class InitialMotion:
         """(N, 3) mm in training frame number `position`, at whose time the spline functions have `weights` (B,)."""
         return np.tensordot(self.coefficients, weights, (1, 0)) + self.at_frames[:, position]
 
-    def of(self, rows: NDArray[np.integer], shares: NDArray[np.floating]) -> InitialMotion:
-        """Motion of M further points, which the flow never found: the mean of those `rows` (M, k), by `shares`."""
+    def carried(self, rows: NDArray[np.integer], shares: NDArray[np.floating]) -> InitialMotion:
+        """Motion of M points that the flow never found: each the mean of its `rows` (M, k), by `shares` (M, k)."""
         coefficients, at_frames = (
             np.einsum("mk,mkbc->mbc", shares, values[rows]).astype(np.float32)
             for values in (self.coefficients, self.at_frames)

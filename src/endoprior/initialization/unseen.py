@@ -56,7 +56,7 @@ def unseen_points(
         if motion is not None:
             distances, nearest = KDTree(moved).query(new, k=min(CARRIERS, len(moved)))
             near = weights_by_distance(np.reshape(distances, (len(new), -1)).astype(np.float64))
-            motions.append(motion.of(np.reshape(nearest, (len(new), -1)), near))
+            motions.append(motion.carried(np.reshape(nearest, (len(new), -1)), near))
             points = new - motions[-1].displacement(weights, position)
         origins = np.full(len(new), position, np.int32)
         found.append(PointCloud(points.astype(np.float32), colors.astype(np.float32), origins))

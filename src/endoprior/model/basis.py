@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from .ops import ModelOps
 
 
+TRAINED, GIVEN = ("motion", "changes"), ("frame_motion",)
+"""Tensors of `temporal_shapes` that gradients train, as outer products; and those that optical flow gives."""
 FRAME_ROUNDING = 1e-9
 """Share of a frame within which a time is that of the frame: f / T, times T, may miss f by a rounding."""
 
@@ -102,9 +104,8 @@ def basis_offsets(
     weights = basis_weights(time, cfg.deformation.basis)
     for name, (functions, channels) in temporal_shapes(cfg).items():
         check_shape(f"{name}:N,{functions},{channels}", **{name: tensors[name]})
-        of_frames = name == "frame_motion"
-        values = tensors[name].detach() if of_frames else tensors[name]
-        totals[name] = _WeightedSum.apply(values, name, weights[name], None if of_frames else sink, ops)
+        values, taken = (tensors[name].detach(), None) if name in GIVEN else (tensors[name], sink)
+        totals[name] = _WeightedSum.apply(values, name, weights[name], taken, ops)
     layout = change_layout(cfg)  # `split` has one gradient; slices have one each, of full size, to add up
     parts = totals["changes"].split([part.stop - part.start for part in layout.values()], 1)
     means = {"means": totals["motion"] + totals["frame_motion"]}

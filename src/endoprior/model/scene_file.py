@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..core.config import OWN, Config
 from ..core.config_io import from_dict
 from ..core.geometry import FARTHEST_MM
@@ -71,8 +71,8 @@ def _config(about: dict[str, Any]) -> Config:
     cfg = config_from(about["config"])
     of_windows, deformation = about["format"] == windowed_scene.FORMAT, cfg.deformation
     if cfg.method == OWN and deformation.kind == "basis" and not deformation.basis.num_frames and not of_windows:
-        want, got = "splines over time", "radial basis functions, of an earlier version"
-        raise input_error("config.deformation.basis", want, got, "Render it with that version, or train again.")
+        got = "radial basis functions, of an earlier version"
+        raise InputError(f"config.deformation.basis: expected splines over time; got {got}.")
     of_one = about["format"] == FORMAT and not about.get("baseline_mm")
     return replace(cfg, data=replace(cfg.data, eyes="left")) if of_one else cfg
 

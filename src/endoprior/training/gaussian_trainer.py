@@ -21,7 +21,7 @@ from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.shell import command
 from ..data import FrameSequence
-from ..model.basis import spline_weights
+from ..model.basis import GIVEN, TRAINED
 from ..model.gaussians import Gaussians, create_gaussians
 from ..model.hexplane import plane_shapes
 from ..model.method import method_of
@@ -36,7 +36,7 @@ from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
-from .optimizer import GIVEN, TEMPORAL, Optimizer
+from .optimizer import Optimizer
 from .photometric import ClearedFrames, smoke_of
 from .step import TrainingStep
 from .tracks import StartTracks
@@ -92,7 +92,7 @@ def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, Arra
     trained = {name: spec for name, spec in trained.items() if name not in GIVEN}
     optimizer = {f"{name}.{moment}": spec for name, spec in trained.items() for moment in ("first", "second")}
     for name, spec in trained.items():
-        optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name in TEMPORAL else 1,))
+        optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name in TRAINED else 1,))
     planes = motion.planes(cfg)
     if planes is not None:
         moments = ArraySpec("float32", ("K", planes.channels))
@@ -178,14 +178,7 @@ class GaussianTrainer(Trainer):
             gaussians["motion"].detach()[:] = torch.from_numpy(motion.coefficients)
             gaussians["frame_motion"].detach()[:, trained] = torch.from_numpy(motion.at_frames)
             if cfg.loss.track_weight:
-                num_bases = cfg.deformation.basis.num_bases
-                weights = [spline_weights(frame.time, num_bases) for frame in frames]
-                displacement = [motion.displacement(each, position) for position, each in enumerate(weights)]
-                tracks = StartTracks(
-                    torch.from_numpy(np.stack(displacement).astype(np.float32)),
-                    torch.from_numpy(np.ascontiguousarray(motion.followed.T, np.float32)),
-                    torch.arange(len(motion.coefficients)),
-                ).to(self.device)
+                tracks = StartTracks.along(motion, [frame.time for frame in frames]).to(self.device)
         field = self.motion.field(gaussians["means"].detach(), cfg)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
         shares = torch.zeros(len(self.sequence.indices("train")), VISITS) if self.step_once.doubt else None

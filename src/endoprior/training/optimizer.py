@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.config import Config, OptimConfig
+from ..model.basis import GIVEN, TRAINED
 from ..model.gaussians import ATTRIBUTES, Gaussians, change_layout
 from ..model.motion import Field, RankOneGradient, UnstoredGradient
 from ..system.arrays_file import part
@@ -40,10 +41,6 @@ BASIS_DECAY = 0.1  # share of the rates of temporal coefficients left at `decay_
 EPSILON, BASIS_EPSILON = 1e-15, 1e-7
 """Adam's epsilon, and that for temporal coefficients and gloss: else the faint gradient that leaks to what tools hide
 would move it as fast as any other."""
-TEMPORAL = ("motion", "changes")
-"""Tensors of temporal coefficients, which Adam steps by outer products, only functions with a weight."""
-GIVEN = ("frame_motion",)
-"""Tensors of Gaussians that no gradient trains."""
 LATE = 0.75  # share of `decay_iterations` after which the rates without a final value begin to fall
 
 
@@ -92,7 +89,7 @@ class Optimizer:
         self.gaussians, self.field, self.cfg, self._ops = gaussians, field, cfg, ops
         self.states = {name: AdamState(param) for name, param in self._dense().items()}
         self.rates = {name: rate_of(name) for name in self.states}
-        for name in TEMPORAL:
+        for name in TRAINED:
             if name in gaussians.tensors:
                 self.states[name] = AdamState(gaussians[name], gaussians[name].shape[1])
         self.planes = PlaneAdam(field.grid, EPSILON) if field and field.grid else None
@@ -126,7 +123,7 @@ class Optimizer:
             states, params = [self.states[name] for name in names], [gaussians[name] for name in names]
             adam_unstored_step(states, params, unstored, self.rates[names[0]](iteration), EPSILON)
             return
-        for name in TEMPORAL:
+        for name in TRAINED:
             if own := [each for each in gradients if isinstance(each, RankOneGradient) and each.name == name]:
                 rates = temporal_rates(name, self.cfg, iteration)
                 self._ops.adam_basis_step(self.states[name], gaussians[name], own, rates, BASIS_EPSILON, skip)
@@ -160,7 +157,7 @@ class Optimizer:
 
     def _dense(self) -> dict[str, Tensor]:
         """Parameters whose gradient autograd writes to `.grad`, by name."""
-        found = {name: value for name, value in self.gaussians.tensors.items() if name not in (*TEMPORAL, *GIVEN)}
+        found = {name: value for name, value in self.gaussians.tensors.items() if name not in (*TRAINED, *GIVEN)}
         return found | (self.field.parameters if self.field else {})
 
     def _clear_dense(self) -> None:

@@ -16,11 +16,11 @@ from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..data import FrameSequence
 from ..initialization.sampling import has_surface
+from ..model.basis import GIVEN
 from ..model.method import method_of
 from ..model.presets import preset, preset_names
 from ..system.memory import available_bytes
 from .gaussian_method import GaussianMethod
-from .optimizer import GIVEN
 
 
 def reject_ignored_options(cfg: Config) -> None:

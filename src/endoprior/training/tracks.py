@@ -8,6 +8,7 @@ point of flat tissue went where: without this term, training lets tissue slide.
 # pyright: reportCallIssue=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +19,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..core.types import Camera
+from ..initialization.motion_fit import InitialMotion
+from ..model.basis import spline_weights
 from .frames import TrainingFrame
 
 REFERENCE_WIDTH_PX = 640
@@ -33,6 +36,17 @@ class StartTracks:
     displacement: Tensor  # (T, P, 3) of the point from its source frame in each training frame, mm
     followed: Tensor  # (T, P) float, 1 where the flow found the point in a training frame and returned to it, else 0
     rows: Tensor  # (N,) int64 track of each Gaussian: its own, or that of the first Gaussian it descends from
+
+    @staticmethod
+    def along(motion: InitialMotion, times: Sequence[float]) -> StartTracks:
+        """The tracks of P points, a Gaussian on each. Args: times: of the T training frames, in [0, 1]."""
+        weights = [spline_weights(time, motion.coefficients.shape[1]) for time in times]
+        displacement = [motion.displacement(each, position) for position, each in enumerate(weights)]
+        return StartTracks(
+            torch.from_numpy(np.stack(displacement).astype(np.float32)),
+            torch.from_numpy(np.ascontiguousarray(motion.followed.T, np.float32)),
+            torch.arange(len(motion.coefficients)),
+        )
 
     def inherited(self, parents: Tensor) -> StartTracks:
         """The tracks of new Gaussians: (N',) `parents` are the rows of those that they were, or come from."""
