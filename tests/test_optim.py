@@ -9,11 +9,13 @@ import torch
 
 from endoprior.core.config import OptimConfig
 from endoprior.model.gaussians import change_layout, create_gaussians
+from endoprior.model.method import method_of
 from endoprior.model.motion import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import BASIS_DECAY, Optimizer, late_share, log_linear, rate_of, temporal_rates
+from endoprior.training.trainer import Stage
 
 
 def test_update_is_torchs_adam():
@@ -90,3 +92,24 @@ def test_rates_of_temporal_coefficients_follow_the_layout():
     assert others == pytest.approx(cfg.optim.basis_lr) and rates["motion"] == pytest.approx(cfg.optim.basis_lr)
     for name, before in rates.items():
         assert temporal_rates(name, cfg, cfg.optim.decay_iterations) == pytest.approx(before * BASIS_DECAY)
+
+
+def test_published_schedules_have_the_rates_of_3dgs_and_ours_faster_ones():
+    def first(name, preset_name):
+        return rate_of(name, preset(preset_name), 1.0)(1)
+
+    assert [first(name, "paper") for name in ("sh_dc", "opacity_logits")] == [2.5e-3, 5e-2]
+    assert [first(name, "default") for name in ("sh_dc", "opacity_logits")] == [4e-3, 8e-2]
+    assert first("color_slopes", "default") == 2.5e-3  # faster ones diverge
+
+
+def test_an_epoch_of_ours_takes_every_frame_once_and_a_published_one_any_at_random():
+    def positions(name):
+        cfg, method = preset(name), method_of(preset(name))
+        rngs = (np.random.default_rng([cfg.seed, i]) for i in range(1, 41))
+        return [method.position(cfg, Stage.FINE, i, 8, rng) for i, rng in enumerate(rngs, 1)]
+
+    ours, literal = positions("default"), positions("paper")
+    assert all(sorted(ours[i : i + 8]) == [*range(8)] for i in range(0, 40, 8)) and ours[:8] != ours[8:16]
+    assert any(sorted(literal[i : i + 8]) != [*range(8)] for i in range(0, 40, 8))
+    assert method_of(preset("default")).position(preset("default"), Stage.COARSE, 5, 8, np.random.default_rng(0)) == 0
