@@ -312,8 +312,8 @@ def test_relative_lengths_are_not_called_mm(facts):
 def test_no_text_of_the_figure_is_cut_off(facts, whole, tmp_path, monkeypatch, is_relative):
     shown, save = [], Figure.savefig
 
-    def record(figure, *args):
-        save(figure, *args)
+    def record(figure, *args, **options):
+        save(figure, *args, **options)
         axes_texts = [
             text for axes in figure.findobj(Axes) for text in (axes.title, axes.xaxis.label, axes.yaxis.label)
         ]
