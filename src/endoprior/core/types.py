@@ -61,6 +61,8 @@ class Frame:
     """(H, W) True where depth was measured."""
     weight: NDArray[np.float32] | None = None
     """(H, W) in [0, 1]: how far a pixel is to be believed, as M of Eq. (1) where it is tissue; None: 1 everywhere."""
+    depth_confidence: NDArray[np.float32] | None = None
+    """(H, W) in [0, 1]: how surely the depth was measured, 0 where it is a guess; None: 1 everywhere, or not known."""
 
     @property
     def rgb(self) -> NDArray[np.float32]:

@@ -46,6 +46,7 @@ def assemble(
     images: list[Path],
     files: Sequence[Path] = (),
     clip_depth: bool = True,
+    confidence: Callable[[int], NDArray[np.float32]] | None = None,
     right_eye: RightEye | None = None,
     mask_folder: str = "masks",
     mask_files: Sequence[Path] = (),
@@ -63,6 +64,7 @@ def assemble(
         files: the other files of the sequence, for its fingerprint.
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
+        confidence: of the depth of kept frame i, see `Frame.depth_confidence`.
         right_eye, mask_folder, mask_files, new_mask_files: see `FrameSequence`; at full size.
         about: `frames_per_second`, `truth`, `remarks`, `mask_tool_value`, `depth_is_relative`, `sources` of
             `FrameSequence`.
@@ -87,7 +89,10 @@ def assemble(
     def read_frame(index: int) -> Frame:
         rgb_u8, tissue_mask, measured = decode(index)
         depth, depth_valid = clean_depth(measured, cfg) if clip_depth else (measured, measured > 0)
-        frame = Frame(index, index / count, cameras[index], rgb_u8, tissue_mask, depth, depth_valid)
+        sureness = None if confidence is None else confidence(index)
+        frame = Frame(
+            index, index / count, cameras[index], rgb_u8, tissue_mask, depth, depth_valid, depth_confidence=sureness
+        )
         return shrunk(frame, cfg.shrink)
 
     return FrameSequence(

@@ -19,10 +19,19 @@ from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import frame_weights, intrinsics_of, read_description
-from .files import IMAGE_SUFFIXES, list_files, read_json
+from .files import CONFIDENCE, IMAGE_SUFFIXES, list_files, read_json
 from .formats import Format
 from .frame_files import Kind, files_of_images, one_per_frame
-from .images import DEPTH_SUFFIXES, decode_image, read_color, read_depth, read_depth_file, read_tool_mask, read_values
+from .images import (
+    DEPTH_SUFFIXES,
+    decode_image,
+    read_color,
+    read_depth,
+    read_depth_file,
+    read_share,
+    read_tool_mask,
+    read_values,
+)
 from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, scale_of, world_to_camera
 from .reading import read_numpy
 from .sequence import FrameSequence, is_test_frame
@@ -89,6 +98,8 @@ def load_endonerf(
     new_masks = [] if masks or len(kept) < len(images) else [path / "masks" / f"{image.stem}.png" for image in images]
     images = [images[i] for i in kept]
     mask_files, depth_files = ([files[i] for i in kept] if files else [] for files in (masks, depths))
+    sureness = [path / CONFIDENCE / f"{image.stem}.png" for image in images]
+    sureness = sureness if cfg.reliability == "used" and depths and (path / CONFIDENCE).is_dir() else []
     tool_value = described.get("mask_tool_value", 255)
 
     def decode(index: int) -> Pixels:
@@ -113,7 +124,7 @@ def load_endonerf(
         [cameras[i] for i in kept],
         decode,
         images=images,
-        files=[*mask_files, *depth_files, *filter(Path.exists, facts_here), *(fact_files or [])],
+        files=[*mask_files, *depth_files, *sureness, *filter(Path.exists, facts_here), *(fact_files or [])],
         frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
         truth=truth,
         right_eye=right_eye,
@@ -125,6 +136,7 @@ def load_endonerf(
         depth_is_relative=relative,
         sources=described.get("sources") or {},
         frame_weights=weights[kept],
+        confidence=(lambda index: read_share(sureness[index], size)) if sureness else None,
     )
 
 

@@ -20,6 +20,7 @@ MASK_WORDS = {
     "mask", "masks", "msk", "seg", "segm", "segmentation", "label", "labels", "annotation", "annotations", "watershed",
     "instance", "instances", "semantic", "binary", "gt", "groundtruth", "ids", "matte",
 }  # fmt: skip
+CONFIDENCE = "depth_confidence"  # folder with how surely the depth of each frame was measured, 8 bits
 DEPTH_WORDS = {"depth", "depths", "disp", "disparity", "z"}
 OTHER_WORDS = {"normal", "normals", "flow", "occlusion", "overlay", "confidence", "uncertainty", "visualization", "vis"}
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of color images that readers accept

@@ -151,6 +151,14 @@ def read_tool_mask(path: Path, tool_value: int = 255, size: Size | None = None) 
     return high if tool_value == 255 else ~high
 
 
+def read_share(path: Path, size: Size | None = None) -> NDArray[np.float32]:
+    """(H, W) in [0, 1] of an 8-bit gray image, whose 255 stands for 1."""
+    pixels = single_channel(path, decode_image(path, size))
+    if pixels.dtype != np.uint8:
+        raise input_error(path, "an 8-bit gray image", describe_pixels(pixels), "save it with values 0 to 255.")
+    return pixels.astype(np.float32) / np.float32(255)
+
+
 def read_depth(path: Path, scale: float = 1.0, size: Size | None = None) -> NDArray[np.float32]:
     """(H, W) depth, mm, of an 8-bit or 16-bit image, gray or with equal channels; `scale` is mm per unit of the file.
 

@@ -97,7 +97,11 @@ def shrunk(frame: Frame, factor: int) -> Frame:
     with np.errstate(over="ignore"):  # a mean beyond float32 counts as missing
         depth = _blocks(frame.depth, factor).mean((1, 3), dtype=np.float32)
     valid = _blocks(frame.depth_valid, factor).all((1, 3)) & np.isfinite(depth)
-    weight = None if frame.weight is None else _blocks(frame.weight, factor).mean((1, 3), dtype=np.float32)
+    means = {
+        name: _blocks(values, factor).mean((1, 3), dtype=np.float32)
+        for name in ("weight", "depth_confidence")
+        if (values := getattr(frame, name)) is not None
+    }
     return replace(
         frame,
         camera=shrunk_camera(frame.camera, factor),
@@ -105,7 +109,7 @@ def shrunk(frame: Frame, factor: int) -> Frame:
         tissue_mask=_blocks(frame.tissue_mask, factor).all((1, 3)),
         depth=np.where(valid, depth, np.float32(0)),
         depth_valid=valid,
-        weight=weight,
+        **means,
     )
 
 

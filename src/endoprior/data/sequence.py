@@ -281,7 +281,8 @@ class FrameSequence:
 
 
 def _frame_bytes(frame: Frame) -> int:
-    return sum(array.nbytes for array in (frame.rgb_u8, frame.tissue_mask, frame.depth, frame.depth_valid))
+    arrays = frame.rgb_u8, frame.tissue_mask, frame.depth, frame.depth_valid, frame.weight, frame.depth_confidence
+    return sum(array.nbytes for array in arrays if array is not None)
 
 
 class FrameList(Sequence[Frame]):

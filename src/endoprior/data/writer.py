@@ -215,6 +215,10 @@ class FrameFiles:
             self._file(f"{folder}/{self.count:06d}.png").write_bytes(data)
         self.count += 1
 
+    def save(self, folder: str, index: int, pixels: NDArray) -> None:
+        """Write an image of frame `index` into `folder`, which is made."""
+        save_png(self._file(f"{folder}/{index:06d}.png"), pixels)
+
     def depth_units(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
         """(H, W) z in mm as a file stores it; 0 where it is missing or too far."""
         units = np.round(np.where(np.isfinite(depth) & (depth > 0), depth, 0) / self.meta.depth_scale)

@@ -34,6 +34,7 @@ EPSILON = 1e-6  # keeps Eq. (6) finite where the mask or the prior is empty
 MIN_SQUARED_SPACING = 1e-7  # mm^2; initial scale of points that coincide, as EndoGaussian sets it
 ADAPTIVE_PERCENTILE = 97.0  # percentile of brightness that raises tau_v (released code)
 PRIOR_BYTES = 200  # memory per pixel while sampling the points of a frame, bytes
+GUESSED = 0.25  # how far a depth that is a guess is believed beside one that was measured
 MIN_POINTS = 4  # the initial scale needs three neighbors
 
 log = logging.getLogger(__name__)
@@ -160,6 +161,11 @@ def has_surface(frame: Frame) -> NDArray[np.bool_]:
     return frame.depth_valid & (frame.depth > NEAR_Z) & (frame.depth < FARTHEST_MM)
 
 
+def depth_weight(confidence: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) how far a depth of some confidence (H, W) is believed: from `GUESSED` for a guess to 1."""
+    return np.float32(GUESSED) + np.float32(1 - GUESSED) * confidence
+
+
 def pixel_probability(frame: Frame, cfg: InitConfig, released_prior: bool = False) -> NDArray[np.float64]:
     """(H, W) sampling weight >= 0 of each pixel for the sampler of `cfg`; 0 outside tissue or `has_surface`.
 
@@ -177,6 +183,8 @@ def pixel_probability(frame: Frame, cfg: InitConfig, released_prior: bool = Fals
     probability = sampling_distribution(rho, frame.tissue_mask)
     if frame.weight is not None:
         probability = probability * frame.weight
+    if frame.depth_confidence is not None:
+        probability = probability * depth_weight(frame.depth_confidence)
     return np.where(has_surface(frame), probability, 0.0)
 
 

@@ -15,7 +15,9 @@ from .stereo import StereoConfig
 Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]
 NETWORK, SAM2 = "depth-anything", "sam2"
 """Values of --depth and --masks that a folder of weights, or the name of a model, may follow after a colon."""
-METHODS = ("auto", "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK, SAM2)
+MOTION, SHADING = "motion", "shading"
+"""Values of --depth; the first may be followed by a colon and another one, which fills what motion does not measure."""
+METHODS = ("auto", MOTION, "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK, SAM2)
 """Values of --depth, --masks and --poses that are no paths."""
 Rectangle = tuple[int, int, int, int]  # x, y, width, height in px, in one camera's image of the source video
 
@@ -34,7 +36,7 @@ def parse_rectangle(text: str, option: str) -> Rectangle:
 
 def names_path(value: str) -> bool:
     """Whether a value of --depth, --masks or --poses is a file or folder of the user."""
-    return value not in METHODS and value.partition(":")[0] not in (NETWORK, SAM2)
+    return value not in METHODS and value.partition(":")[0] not in (NETWORK, SAM2, MOTION)
 
 
 def is_sam2(value: str) -> bool:
@@ -89,8 +91,9 @@ class PrepareConfig:
 
     depth: str = "auto"
     """`sgbm` (stereo), `shading` (monocular, relative), `depth-anything` (network, relative; the folder of its weights
-    may follow after a colon), a folder of depth files, or `none`. `auto` is `sgbm` for two cameras, `shading` for one.
-    """
+    may follow after a colon), a folder of depth files, `motion` (parallax of a moving camera, filled by shading, or by
+    what follows after a colon), or `none`. `auto` is `sgbm` for two cameras; for one `motion` where the camera moves
+    enough, else `shading`."""
     depth_unit_mm: float = 0.0
     """mm per unit of the files in a depth folder; required with such a folder unless its depth is relative."""
     depth_relative: Literal["no", "depth", "disparity"] = "no"
@@ -119,6 +122,17 @@ class PrepareConfig:
     """Folder of the STIR clip (`left/seqNN`) that VIDEO belongs to: its tattooed points become `truth/tracks.npz`."""
     keep_right: bool = False
     """Also write the images of the right camera to `right/`."""
+
+    @property
+    def guess(self) -> str:
+        """How depth is made of single frames: `depth`, or what fills it where motion measures."""
+        method, _, filler = self.depth.partition(":")
+        return (filler or SHADING) if method == MOTION else self.depth
+
+    @property
+    def demands_motion(self) -> bool:
+        """Whether depth is to be measured by the motion of the camera, and nothing else will do."""
+        return self.depth.partition(":")[0] == MOTION
 
     def __post_init__(self) -> None:
         if self.stir is not None and self.depth == "none":

@@ -258,7 +258,7 @@ def input_facts(cfg: PrepareConfig) -> dict[str, dict[str, object]]:
     """Identity of each file and folder that an option names, by the option."""
     named = {
         "--right": cfg.right, "--calibration": cfg.calibration, "--stir": cfg.stir, "--masks": Path(cfg.masks),
-        "--depth": Path(cfg.depth), "--poses": Path(cfg.poses),
+        "--depth": Path(cfg.guess), "--poses": Path(cfg.poses),
     }  # fmt: skip
     return {name: source_facts(path) for name, path in named.items() if path and kind_of(path) != "nothing"}
 

@@ -92,7 +92,7 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
             "(rel.). For mm use a stereo video or measured depth."
         )
     elif kind == "folder" and measure is not None:
-        notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
+        notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.guess)
     wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
     return FrameMethods(measure, shade, tools, first_pass.hidden, kind == "sgbm", wanted, sources, relative, notes)
@@ -117,12 +117,12 @@ def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
 
 def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
     """The depth method that --depth selects; InputError for --depth-relative without a depth folder."""
-    if cfg.depth == "auto":
+    if cfg.guess == "auto":
         kind: DepthKind = "sgbm" if clip.stereo else "shading"
-    elif cfg.depth in ("none", "sgbm", "shading"):
-        kind = cfg.depth
+    elif cfg.guess in ("none", "sgbm", "shading"):
+        kind = cfg.guess
     else:
-        kind = "network" if cfg.depth.partition(":")[0] == NETWORK else "folder"
+        kind = "network" if cfg.guess.partition(":")[0] == NETWORK else "folder"
     if cfg.depth_relative != "no" and kind != "folder":
         raise input_error("--depth-relative", "a folder with --depth", cfg.depth, "Remove --depth-relative.")
     return kind
@@ -139,13 +139,13 @@ def _measured_depth(
     if kind == "network":
         from .networks import DepthNetwork  # imports torch
 
-        network = DepthNetwork(cfg.depth.partition(":")[2])
+        network = DepthNetwork(cfg.guess.partition(":")[2])
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
-    files, notes = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
+    files, notes = match_files(Path(cfg.guess), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
     if cfg.depth_relative == "no":
         if not cfg.depth_unit_mm:
             fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
-            raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
+            raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.guess}", "none", fix)
         some = spread(len(first_pass.indices), FITTED_SAMPLES)
         notes += _check_stored([read_stored(files[first_pass.indices[i]]) for i in some])
 

@@ -17,6 +17,7 @@ from ..core.checks import input_error, number_ranges
 from ..core.shell import changed_options, command
 from ..data import write_stir_tracks
 from ..data.description import SIZE_NOT_STATED, PrepareRecord
+from ..data.files import CONFIDENCE
 from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncertain_frames
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
@@ -33,6 +34,7 @@ from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
 from .frame_tools import masked_frames
 from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
+from .parallax.measure import measure_depth
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -124,6 +126,7 @@ def prepare(
         unexplained, weights = _unexplained(path, files, damaged, facts)
         if path is not None:
             _use_path(files, path)
+        motion_notes += _use_parallax(video, cfg, files, path, progress)
         shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
         RowLog(folder).remove()
         files.finish(None if path is None else path.camera_to_world, unexplained, weights.tolist())
@@ -235,6 +238,43 @@ def _use_path(files: FrameFiles, path: CameraPath) -> None:
     fx, fy = files.meta.fx * path.focal_factor, files.meta.fy * path.focal_factor
     files.meta = replace(files.meta, fx=fx, fy=fy, sources=path.sources(files.meta.sources))
     files.write_json(PATH_RECORD, path.record())
+
+
+def _use_parallax(
+    video: Path, cfg: PrepareConfig, files: _Written, path: CameraPath | None, progress: Progress
+) -> list[str]:
+    """Measure relative depth by the motion of the camera where it tells, and bend the depth of the frames to it."""
+    if not (cfg.demands_motion or (cfg.depth == "auto" and files.meta.depth_relative)):
+        return []
+    meta, doubt, found = files.meta, "the camera is still, or its path is unknown", None
+    if path is not None and not path.is_unknown:
+        found = measure_depth(
+            files.pose_input,
+            np.linalg.inv(path.camera_to_world),
+            path.explained,
+            np.array([[meta.fx, 0, meta.cx - 0.5], [0, meta.fy, meta.cy - 0.5], [0, 0, 1]]),
+            (meta.width, meta.height),
+            files.folder / WORK,
+            lambda done: progress("depth by parallax", done, files.count),
+        )
+        doubt = found.doubt
+    if cfg.demands_motion and doubt:
+        raise input_error(video, "a camera whose motion tells the depth", doubt, f"Use `--depth {cfg.guess}`.")
+    if found is None or doubt:
+        return [] if found is None else [f"depth is not measured by the motion of the camera: {doubt}"]
+    delete_plan(files.folder)  # to bend depth twice would be wrong
+
+    def bend(index: int) -> tuple[int, NDArray[np.uint16], NDArray[np.uint8]]:
+        guess = read_depth(files.file("depth", index), meta.depth_scale)
+        return index, files.depth_units(found.filled(index, guess)), found.sureness(index, (meta.width, meta.height))
+
+    with frame_threads(BYTES_PER_PX * meta.width * meta.height) as pool:
+        for index, units, sureness in pool.map(bend, range(files.count)):
+            save_png(files.file("depth", index), units)
+            files.save(CONFIDENCE, index, sureness)
+    source = f"parallax on {found.share:.0%} of the tissue, filled by {meta.depth_source}"
+    files.meta = replace(meta, depth_source=source, sources=meta.sources | {"depth": source})
+    return [f"depth is measured by the motion of the camera: {source}"]
 
 
 def _unexplained(

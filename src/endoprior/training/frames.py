@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..core.types import Camera, Frame
 from ..data import FrameSequence, shrunk
-from ..initialization.sampling import has_surface
+from ..initialization.sampling import depth_weight, has_surface
 from ..initialization.unseen import convex_hull
 from ..priors import Border, joint_texture_prior
 from ..system.memory import BoundedCache, cache_bytes
@@ -32,10 +32,17 @@ class TrainingFrame:
     num_measured: int  # pixels of `measured`
     brightness: float  # mean color over tissue, in [0, 1]; 0 without tissue
     weight: Tensor | None = None  # (H, W) float32 in [0, 1], how far each pixel is to be believed; None: all alike
+    depth_weight: Tensor | None = None  # (H, W) float32 in [0, 1], how far its depth is, see `depth_weight`; None: 1
 
     def counted(self, mask: Tensor) -> Tensor:
         """A mask (H, W) as the loss counts it: bool, or float32 in [0, 1] where pixels have weights."""
         return mask if self.weight is None else mask * self.weight
+
+    @property
+    def counted_depth(self) -> Tensor:
+        """`measured` (H, W) as the loss counts it."""
+        counted = self.counted(self.measured)
+        return counted if self.depth_weight is None else counted * self.depth_weight
 
     @property
     def reliability(self) -> float:
@@ -137,6 +144,7 @@ def _training_frame(frame: Frame) -> TrainingFrame:
         num_measured=int(np.count_nonzero(frame.tissue_mask & usable)),
         brightness=float(frame.rgb_u8[frame.tissue_mask].mean()) / 255 if frame.tissue_mask.any() else 0.0,
         weight=None if frame.weight is None else torch.from_numpy(frame.weight),
+        depth_weight=None if frame.depth_confidence is None else torch.from_numpy(depth_weight(frame.depth_confidence)),
     )
 
 

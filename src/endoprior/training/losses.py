@@ -120,7 +120,7 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, o
         frame.rgb_u8,
         frame.inverse_depth,
         frame.counted(frame.tissue_mask),
-        frame.counted(frame.measured),
+        frame.counted_depth,
         (1.0, depth_weight, cfg.tv_weight, cfg.edge_weight),
         not cfg.cover_weight,
     )

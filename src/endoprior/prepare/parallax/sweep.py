@@ -1,0 +1,139 @@
+"""The inverse depth of a frame: a plane sweep at low resolution, then two finer searches around what it found.
+
+Planes are even in inverse depth w. A pixel is compared with its partners by the zero-mean normalized correlation of a
+window, which bears changes of light; of the partners the better half counts, because the others may not see the place
+(Kang et al. 2001). In the finer searches the window follows the surface that is known already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .semi_global import aggregated
+from .views import View, Warp, matrix_at
+
+COARSE_WIDTH, FINE_WIDTH = 128, 256  # px
+PLANES = 48
+NEAREST, FARTHEST = 0.25, 3.5  # depth of the first and the last plane, as a multiple of the clip's middle distance
+COARSE_WINDOW_PX, FINE_WINDOW_PX = 7, 9
+STEP_COST, JUMP_COST = 0.1, 0.6  # of 1 - correlation
+FINER = (1 / 3, 1 / 9)  # steps of the finer searches, as shares of that between two planes
+AROUND = 3  # ... and their number on each side
+SMOOTH_PX = 1.5  # standard deviation by which the correlations of a finer search are smoothed
+NOISE = 2e-4  # variance of the detail that is noise
+COVERED = 0.6  # least share of a window that both frames show
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame and where its camera is."""
+
+    view: View  # at the fine size
+    pose: NDArray[np.float64]  # (4, 4) world to camera
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What all frames of a clip have in common."""
+
+    size: tuple[int, int]  # (w, h) of the fine views, px
+    matrix: NDArray[np.float64]  # (3, 3) K at that size, px; the left-most pixel is centered at 0
+    planes: NDArray[np.float32]  # (D,) inverse depths, ascending
+
+    @classmethod
+    def of(cls, matrix: NDArray[np.float64], size: tuple[int, int], distance: float) -> Sweep:
+        """For frames of `size` (W, H) whose tissue is `distance` away. Args: matrix: K of the frames, centered at 0."""
+        small = scaled_size(size, FINE_WIDTH)
+        planes = np.linspace(1 / (FARTHEST * distance), 1 / (NEAREST * distance), PLANES, dtype=np.float32)
+        return cls(small, matrix_at(matrix, size, small), planes)
+
+    def inverse_depth(self, shot: Shot, partners: Sequence[Shot]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(h, w) inverse depth of a frame, and the correlation with its partners, -1 to 1."""
+        coarse = scaled_size(self.size, COARSE_WIDTH)
+        found = self._planes(shot, partners, coarse)
+        found = cv2.resize(cv2.medianBlur(found, 5), self.size, interpolation=cv2.INTER_LINEAR)
+        warps = [Warp.between(self.matrix, shot.pose, other.pose, self.size) for other in partners]
+        views = [other.view for other in partners]
+        step, score = float(self.planes[1] - self.planes[0]), np.zeros_like(found)
+        for share in FINER:
+            around = [
+                _correlation(shot.view, views, warps, found + np.float32(k * share * step), FINE_WINDOW_PX)
+                for k in range(-AROUND, AROUND + 1)
+            ]
+            scores = np.stack([cv2.GaussianBlur(each, (0, 0), SMOOTH_PX) for each in around]).astype(np.float32)
+            place, score = peak(scores)
+            found = cv2.medianBlur(found + np.float32(share * step) * (place - AROUND), 5)
+        return np.clip(found, self.planes[0], self.planes[-1]).astype(np.float32), score.astype(np.float32)
+
+    def _planes(self, shot: Shot, partners: Sequence[Shot], size: tuple[int, int]) -> NDArray[np.float32]:
+        """(h, w) inverse depth at the coarse size, by all planes."""
+        matrix = matrix_at(self.matrix, self.size, size)
+        warps = [Warp.between(matrix, shot.pose, other.pose, size) for other in partners]
+        here, views = shot.view.resized(size), [other.view.resized(size) for other in partners]
+        costs = np.empty((size[1], size[0], len(self.planes)), np.float32)
+        for d, inverse in enumerate(self.planes):
+            costs[..., d] = 1 - _correlation(here, views, warps, inverse, COARSE_WINDOW_PX)
+        place, _ = peak(np.ascontiguousarray(-aggregated(costs, STEP_COST, JUMP_COST).transpose(2, 0, 1)))
+        return np.interp(place, np.arange(len(self.planes)), self.planes).astype(np.float32)
+
+
+def _correlation(
+    view: View,
+    partners: Sequence[View],
+    warps: Sequence[Warp],
+    inverse: NDArray[np.float32] | np.float32,
+    window_px: int,
+) -> NDArray[np.float32]:
+    """(h, w) mean correlation with the better half of the partners at an inverse depth; -1 with what is not seen."""
+    scores = []
+    for other, warp in zip(partners, warps, strict=True):
+        x, y, _ = warp.at(inverse)
+        detail, usable = (cv2.remap(each, x, y, cv2.INTER_LINEAR) for each in (other.detail, other.usable))
+        scores.append(correlation(view, np.asarray(detail, np.float32), np.asarray(usable, np.float32), window_px))
+    kept = (len(scores) + 1) // 2
+    return np.sort(np.stack(scores), 0)[-kept:].mean(0)
+
+
+def correlation(
+    view: View, detail: NDArray[np.float32], usable: NDArray[np.float32], window_px: int
+) -> NDArray[np.float32]:
+    """(h, w) zero-mean normalized correlation of windows of two views, over what both show; -1 where that is little.
+
+    Args:
+        detail, usable: (h, w) of the other view, warped to the first one.
+    """
+
+    def mean(values: NDArray) -> NDArray:
+        return cv2.boxFilter(values, -1, (window_px, window_px), borderType=cv2.BORDER_CONSTANT)
+
+    weight = view.usable * usable
+    covered = mean(weight)
+    share = np.float32(1) / np.maximum(covered, np.float32(1e-3))
+    first, second = view.detail * weight, detail * weight
+    mean1, mean2 = mean(first) * share, mean(second) * share
+    variance1 = np.maximum(mean(first * view.detail) * share - mean1 * mean1, 0)
+    variance2 = np.maximum(mean(second * detail) * share - mean2 * mean2, 0)
+    product = mean(first * detail) * share - mean1 * mean2
+    return np.where(covered > COVERED, product / np.sqrt(variance1 * variance2 + np.float32(NOISE**2)), np.float32(-1))
+
+
+def peak(scores: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(h, w) place of the largest of scores (D, h, w), to a fraction by a parabola, and its score."""
+    best = scores.argmax(0)[None]
+    middle = np.clip(best, 1, len(scores) - 2)
+    low, score, high = (np.take_along_axis(scores, middle + k, 0)[0] for k in (-1, 0, 1))
+    bend = low - 2 * score + high
+    shift = np.divide(0.5 * (low - high), bend, out=np.zeros_like(bend), where=np.abs(bend) > 1e-6)
+    place = np.where(best == middle, best + np.clip(shift, -0.5, 0.5), best)[0]
+    return place.astype(np.float32), np.take_along_axis(scores, best, 0)[0]
+
+
+def scaled_size(size: tuple[int, int], width: int) -> tuple[int, int]:
+    """(w, h) of an image of (W, H) that is at most `width` px wide."""
+    factor = min(1.0, width / size[0])
+    return max(round(size[0] * factor), 1), max(round(size[1] * factor), 1)
