@@ -220,7 +220,7 @@ def test_a_guess_is_bent_to_what_is_measured_and_stays_where_nothing_is():
 
 def errors(found, frames, index, guess=80.0):
     """Relative error (H, W) of the filled depth of a frame after one factor for all."""
-    depth = found.filled(index, np.full((HEIGHT, WIDTH), guess, np.float32))
+    depth = found.depth(index, np.full((HEIGHT, WIDTH), guess, np.float32))
     return np.abs(depth / frames[index].depth - 1)
 
 

@@ -266,7 +266,7 @@ def _use_parallax(
 
     def bend(index: int) -> tuple[int, NDArray[np.uint16], NDArray[np.uint8]]:
         guess = read_depth(files.file("depth", index), meta.depth_scale)
-        return index, files.depth_units(found.filled(index, guess)), found.sureness(index, (meta.width, meta.height))
+        return index, files.depth_units(found.depth(index, guess)), found.sureness(index, (meta.width, meta.height))
 
     with frame_threads(BYTES_PER_PX * meta.width * meta.height) as pool:
         for index, units, sureness in pool.map(bend, range(files.count)):

@@ -1,11 +1,11 @@
 """Depth of all frames of a clip from the motion of its camera: measured, checked, and filled by a guess.
 
-Frames are independent of each other: each is measured with its partners, then checked against what they measured.
+Each frame is measured with its partners, then checked against what they measured and filled, then made steady.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,34 +17,30 @@ from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
 from ..camera_path.tracks import PoseInput
 from .consistency import checked
-from .filling import bent
+from .filling import bent, steady
 from .partners import choose_partners
-from .sweep import FINE_WIDTH, Shot, Sweep
+from .sweep import Shot, Sweep
 from .views import View, Warp
 
 SURE = 0.4  # confidence of a pixel that counts as measured
 LEAST_SHARE = 0.1  # of the tissue that is measured, below which the path does not tell the depth
 LEAST_FRAMES = 0.5  # share of the frames that have partners, below which the camera moves too little
 BYTES_PER_PX = 400  # memory in which a thread measures a frame, bytes for each px of a fine view
-MEASURED, SCORES, CHECKED, SURENESS = "inverse_depth.npy", "correlation.npy", "checked.npy", "confidence.npy"
-"""Files with numbers of all frames, while at work."""
+AROUND = 4  # frames on each side with which the depth of a frame is averaged
 
 
 @dataclass(frozen=True)
 class ParallaxDepth:
-    """Depth of `T` frames from parallax, in the unit of the path."""
+    """What the motion of the camera says of the depth of `T` frames, at a small size (h, w)."""
 
-    inverse: NDArray[np.float32]  # (T, h, w)
+    factor: NDArray[np.float32]  # (T, h, w) that brings the guess to the depth, in the unit of the path
     confidence: NDArray[np.uint8]  # (T, h, w) 0 to 255
     share: float  # of the tissue that is measured
     frames: float  # share of the frames that have partners
 
-    def filled(self, index: int, guess: NDArray[np.float32]) -> NDArray[np.float32]:
+    def depth(self, index: int, guess: NDArray[np.float32]) -> NDArray[np.float32]:
         """(H, W) depth of a frame: the guess (H, W) bent to what is measured; 0 stays."""
-        inverse, confidence = self.inverse[index], self.confidence[index] / np.float32(255)
-        height, width = inverse.shape
-        small = np.asarray(cv2.resize(guess, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
-        factor = cv2.resize(bent(small, inverse, confidence), guess.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        factor = cv2.resize(self.factor[index], guess.shape[::-1], interpolation=cv2.INTER_LINEAR)
         return np.asarray(guess * factor, np.float32)
 
     def sureness(self, index: int, size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -73,58 +69,87 @@ def measure_depth(
     """Measure the depth of all frames.
 
     Args:
-        frame: reads frame i, its depth in the unit of the path; of depth only the middle counts.
+        frame: reads frame i, with a guess of its depth in the unit of the path.
         world_to_camera: (T, 4, 4). usable: (T,) whether a frame has a pose of its own.
         matrix: (3, 3) K, px; the left-most pixel is centered at 0. size: (width, height), px.
-        folder: for files of all frames, 11 bytes for each pixel of a small frame; made if it is not there.
+        folder: for files of all frames, 15 bytes for each pixel of a small frame; made if it is not there.
         progress: is told the number of frames measured.
     """
     count = len(world_to_camera)
     distance = np.array([_distance(frame(i)) for i in range(count)])
     usable = usable & np.isfinite(distance)
     partners = choose_partners(world_to_camera, matrix, size, np.where(usable, distance, 1.0), usable)
-    middle = float(np.median(distance[usable])) if usable.any() else 1.0
-    sweep = Sweep.of(matrix, size, middle)
-    width, height = sweep.size
+    sweep = Sweep.of(matrix, size, float(np.median(distance[usable])) if usable.any() else 1.0)
+    clip, shares, shape = _Clip(frame, world_to_camera, usable, partners, sweep), np.zeros(count), sweep.size[::-1]
     folder.mkdir(exist_ok=True)
-    shape = (count, height, width)
-    measured = np.lib.format.open_memmap(folder / MEASURED, "w+", np.float32, shape)
-    scores = np.lib.format.open_memmap(folder / SCORES, "w+", np.float16, shape)
-    confirmed = np.lib.format.open_memmap(folder / CHECKED, "w+", np.float32, shape)
-    sureness = np.lib.format.open_memmap(folder / SURENESS, "w+", np.uint8, shape)
-    views: BoundedCache[View] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes + view.usable.nbytes)
 
-    def shot(i: int) -> Shot:
-        def view() -> View:
-            seen = frame(i)
-            return View.of(seen.rgb_u8, seen.tissue_mask, sweep.size)
+    def stored(name: str, kind: type) -> NDArray:
+        """Numbers of all frames, which may not fit into memory."""
+        return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (count, *shape))
 
-        return Shot(views.get(i, view), world_to_camera[i])
-
-    def measure(i: int) -> tuple[int, tuple[NDArray, NDArray] | None]:
-        return i, sweep.inverse_depth(shot(i), [shot(j) for j in partners[i]]) if partners[i] else None
-
-    def check(i: int) -> tuple[int, tuple[NDArray, NDArray] | None, float]:
-        others = [j for j in partners[i] if partners[j]]
-        if not others:
-            return i, None, 0.0
-        warps = [Warp.between(sweep.matrix, world_to_camera[i], world_to_camera[j], sweep.size) for j in others]
-        inverse, confidence = checked(measured[i], scores[i], warps, [measured[j] for j in others])
-        tissue = shot(i).view.usable
-        return i, (inverse, confidence * tissue), float((confidence > SURE)[tissue > 0].mean()) if tissue.any() else 0.0
-
-    shares = np.zeros(count)
-    with frame_threads(BYTES_PER_PX * FINE_WIDTH * height) as pool:
-        for i, found in pool.map(measure, range(count)):
+    measured, scores = stored("inverse_depth", np.float32), stored("correlation", np.float16)
+    sureness, filled, factor = stored("confidence", np.uint8), stored("depth", np.float32), stored("factor", np.float32)
+    everything = range(count)
+    with frame_threads(BYTES_PER_PX * shape[0] * shape[1]) as pool:
+        for i, found in zip(everything, pool.map(clip.measured, everything), strict=True):
             if found is not None:
                 measured[i], scores[i] = found
             progress(i + 1)
-        for i, found, share in pool.map(check, range(count)):
-            shares[i] = share
-            if found is not None:
-                confirmed[i], sureness[i] = found[0], np.round(255 * found[1])
+        for i, found in zip(everything, pool.map(lambda i: clip.filled(i, measured, scores), everything), strict=True):
+            filled[i], sureness[i] = found[0], np.round(255 * found[1])
+            shares[i] = (found[1] > SURE).sum() / max(clip.view(i).usable.sum(), 1)
+        for i, found in zip(everything, pool.map(lambda i: clip.factor(i, filled), everything), strict=True):
+            factor[i] = found
     share = float(shares[usable].mean()) if usable.any() else 0.0
-    return ParallaxDepth(confirmed, sureness, share, np.mean([bool(each) for each in partners]).item())
+    return ParallaxDepth(factor, sureness, share, np.mean([bool(each) for each in partners]).item())
+
+
+class _Clip:
+    """The frames of a clip, one at a time."""
+
+    def __init__(
+        self, frame: Callable[[int], PoseInput], poses: NDArray, usable: NDArray, partners: list[tuple[int, ...]],
+        sweep: Sweep,
+    ) -> None:  # fmt: skip
+        self._frame, self._poses, self._usable, self._partners, self._sweep = frame, poses, usable, partners, sweep
+        self._views: BoundedCache[View] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
+
+    def view(self, i: int) -> View:
+        def seen() -> View:
+            frame = self._frame(i)
+            return View.of(frame.rgb_u8, frame.tissue_mask, self._sweep.size)
+
+        return self._views.get(i, seen)
+
+    def measured(self, i: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """`Sweep.inverse_depth` of a frame; None without partners."""
+        others = self._partners[i]
+        shots = [Shot(self.view(j), self._poses[j]) for j in (i, *others)]
+        return self._sweep.inverse_depth(shots[0], shots[1:]) if others else None
+
+    def filled(self, i: int, measured: NDArray, scores: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(h, w) depth of a frame, filled, and its confidence."""
+        guess, others = self._guess(i), [j for j in self._partners[i] if self._partners[j]]
+        if not others:
+            return guess, np.zeros_like(guess)
+        inverse, confidence = checked(measured[i], scores[i], self._warps(i, others), [measured[j] for j in others])
+        confidence *= self.view(i).usable
+        return guess * bent(guess, inverse, confidence), confidence
+
+    def factor(self, i: int, filled: NDArray) -> NDArray[np.float32]:
+        """(h, w) factor of the guess, with the depth of the frames around averaged."""
+        near = range(max(i - AROUND, 0), min(i + AROUND + 1, len(self._poses)))
+        others = [j for j in near if j != i and self._usable[i] and self._usable[j]]
+        depth, guess = steady(filled[i], self._warps(i, others), [filled[j] for j in others]), self._guess(i)
+        return np.divide(depth, guess, out=np.ones_like(depth), where=guess > 0)
+
+    def _warps(self, i: int, others: Sequence[int]) -> list[Warp]:
+        sweep = self._sweep
+        return [Warp.between(sweep.matrix, self._poses[i], self._poses[j], sweep.size) for j in others]
+
+    def _guess(self, i: int) -> NDArray[np.float32]:
+        small = cv2.resize(self._frame(i).depth, self._sweep.size, interpolation=cv2.INTER_NEAREST)
+        return np.asarray(small, np.float32)
 
 
 def _distance(seen: PoseInput) -> float:
