@@ -64,7 +64,7 @@ def assemble(
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
         right_eye, mask_folder, mask_files, new_mask_files: see `FrameSequence`; at full size.
-        about: `frames_per_second`, `truth`, `remarks`, `mask_tool_value`, `depth_is_relative`, `sources` of
+        about: `frames_per_second`, `truth`, `remarks`, `mask_tool_value`, `depth_is_relative`, `scale`, `sources` of
             `FrameSequence`.
     Raises:
         InputError: fewer than 2 frames or no pixel would be left, or a camera has impossible numbers.
