@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error, number_ranges
+from ..core.checks import check_shape, input_error, number_ranges
+from ..core.geometry import project
+from ..core.types import Camera
 from .scale import Scale, demand_plausible
 
 OPTION = "--known-length"
@@ -119,6 +121,28 @@ def scale_by_lengths(
     return Scale(factor, error, f"{what} in {named}")
 
 
+def scale_between(
+    points: NDArray[np.float64], camera: Camera, mm: float, frame: int, old: Scale | None, what: str
+) -> Scale:
+    """The scale at which two points are so many mm apart.
+
+    Args:
+        points: (2, 3) world axes, in the units of a sequence whose scale is `old`, seen by the camera of the frame.
+        what: names the number in errors.
+    Raises:
+        InputError: a length of 0 or less, one point, or a scale that cannot be.
+    """
+    check_shape("points:2,3", points=points)
+    units, factor = float(np.linalg.norm(points[0] - points[1])), old.factor if old else 1.0
+    if not (0 < mm <= MOST_MM and units > 0):
+        got = f"{mm:g} mm" if units > 0 else "one point"
+        raise input_error(what, f"two points and a length above 0, up to {MOST_MM:g} mm", got, "enter the length.")
+    pixels = float(np.linalg.norm(np.subtract(*project(points, camera)[0])))
+    demand_plausible(what, mm / units * factor)
+    error = float(np.hypot(SHAPE_STD, np.sqrt(2) * CLICK_PX / max(pixels, 1.0)))
+    return Scale(mm / units * factor, error, f"known length in frame {frame}")
+
+
 def robust_mean(values: NDArray[np.float64], stds: NDArray[np.float64]) -> tuple[float, float]:
     """Huber's mean of (N,) values, and its standard deviation, by their spread and the (N,) expected ones."""
     mean = float(np.median(values))
@@ -127,6 +151,6 @@ def robust_mean(values: NDArray[np.float64], stds: NDArray[np.float64]) -> tuple
         off = np.abs(values - mean) / stds
         weights = np.minimum(1, HUBER / np.maximum(off, 1e-12)) / stds**2
         mean = float(weights @ values / weights.sum())
-    spread = weights * stds**2 @ ((values - mean) / stds) ** 2  # 1 for each value that is as far off as expected
+    spread = float((((values - mean) / stds) ** 2).sum())  # 1 for each value that is as far off as expected
     growth = (PRIOR_WEIGHT + spread) / (PRIOR_WEIGHT + len(values) - 1)
     return mean, float(np.sqrt(growth / (1 / stds**2).sum()))

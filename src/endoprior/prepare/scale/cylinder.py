@@ -28,7 +28,7 @@ class Axis:
         """From the camera center, > 0."""
         return float(np.linalg.norm(self.foot_mm))
 
-    def nearest_to(self, ray: NDArray[np.float64]) -> NDArray[np.float64]:
+    def nearest_to(self, ray: NDArray) -> NDArray[np.float64]:
         """(3,) the point of the axis that is nearest to a ray (3,) from the camera center, mm.
 
         With unit vectors v of the ray and d of the axis, and the foot p, which is orthogonal to d, it is p + t d at
@@ -41,7 +41,7 @@ class Axis:
         return self.foot_mm + (self.foot_mm @ unit) * along / (1 - along**2) * self.direction
 
 
-def ray_at(pixel: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def ray_at(pixel: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray:
     """(3,) direction of a pixel (x, y), with z = 1. `matrix` (3, 3) K, px, in the same coordinates as the pixel."""
     return np.linalg.solve(matrix, np.array([*pixel, 1.0]))
 

@@ -61,7 +61,7 @@ def image_edge(
 def smoothed(rgb_u8: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(H, W, 3) shares of red, green and blue without their noise, for `image_edge`: light and shadow do not count."""
     sigma = BLUR_PX * max(rgb_u8.shape[1] / 640, 1.0)
-    smooth = cv2.GaussianBlur(rgb_u8.astype(np.float32), (0, 0), sigma) + DARK
+    smooth = np.asarray(cv2.GaussianBlur(rgb_u8.astype(np.float32), (0, 0), sigma), np.float32) + DARK
     return smooth / smooth.sum(-1, keepdims=True)
 
 
@@ -84,7 +84,7 @@ def _strongest(change: NDArray) -> tuple[int, int]:
 def _sampled(image: NDArray[np.float32], at: NDArray) -> NDArray[np.float32]:
     """(N, S, 3) colors at (N, S, 2) x, y; OpenCV counts pixel centers from 0."""
     x, y = (at[..., axis].astype(np.float32) - np.float32(0.5) for axis in (0, 1))
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _peak(change: NDArray, best: NDArray) -> NDArray:

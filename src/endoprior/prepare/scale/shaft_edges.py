@@ -55,7 +55,7 @@ def shafts_of(tools: Mask, outside: Mask, rgb_u8: NDArray[np.uint8] | None = Non
     """
     height, width = tools.shape
     view = np.pad((~outside).astype(np.uint8), 1)  # beyond the image is outside as well
-    depth_in_view = cv2.distanceTransform(view, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    depth_in_view = np.asarray(cv2.distanceTransform(view, cv2.DIST_L2, 5), np.float32)[1:-1, 1:-1]
     smooth = None if rgb_u8 is None else smoothed(rgb_u8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats((tools & ~outside).astype(np.uint8), None, None, None, 8)
     for label in range(1, count):
@@ -72,15 +72,13 @@ def _shaft(tool: Mask, depth_in_view: NDArray[np.float32], smooth: NDArray[np.fl
     if chain is None:
         return None
     tolerance = TOLERANCE_PX * max(px / 640, 1.0)
-    fits = [_straight(part, tolerance, LEAST_LENGTH * px) for part in (chain, chain[::-1])]
-    if fits[0] is None or fits[1] is None:
+    one, other = (_straight(part, tolerance, LEAST_LENGTH * px) for part in (chain, chain[::-1]))
+    if one is not None and other is not None and smooth is not None:
+        between = np.mean([*one[1], *other[1]], 0)
+        one, other = image_edge(smooth, one[1], between), image_edge(smooth, other[1], between)
+    if one is None or other is None:
         return None
-    if smooth is not None:
-        between = np.mean([point for _, ends in fits for point in ends], 0)
-        fits = [image_edge(smooth, ends, between) for _, ends in fits]
-        if fits[0] is None or fits[1] is None:
-            return None
-    (first, ends), (second, other_ends) = fits
+    (first, ends), (second, other_ends) = one, other
     lengths = [float(np.linalg.norm(np.subtract(*each))) for each in (ends, other_ends)]
     # Where both edges are seen: the middle between the middles of the edges.
     inside = (ends[0] + ends[1] + other_ends[0] + other_ends[1]) / 4
@@ -120,7 +118,7 @@ def _free_outline(tool: Mask, depth_in_view: NDArray[np.float32]) -> NDArray[np.
     touch the border in one place.
     """
     contours, _ = cv2.findContours(tool.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = max(contours, key=len)[:, 0]
+    outline = np.asarray(max(contours, key=len), np.intp)[:, 0]
     free = depth_in_view[outline[:, 1], outline[:, 0]] > AT_BORDER_PX
     if free.all() or not free.any():
         return None
@@ -129,7 +127,7 @@ def _free_outline(tool: Mask, depth_in_view: NDArray[np.float32]) -> NDArray[np.
     changes = np.flatnonzero(np.diff(np.concatenate([[0], free.view(np.int8), [0]])))
     runs = sorted(zip(changes[::2], changes[1::2], strict=True), key=lambda run: run[1] - run[0])
     begin, end = runs[-1]
-    return outline[begin:end] + 0.5 if end - begin >= 0.7 * free.sum() else None
+    return (outline[begin:end] + 0.5).astype(np.float64) if end - begin >= 0.7 * free.sum() else None
 
 
 def _straight(chain: NDArray, tolerance: float, least: float) -> tuple[NDArray, tuple[NDArray, NDArray]] | None:
