@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from view_client import Client, at_work, wait_until
 
 from endoprior.check import find, measure
 from endoprior.check.report import table
 from endoprior.cli import main
+from endoprior.cli.view import open_viewable
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence, scale_files
+from endoprior.data.images import save_png
 from endoprior.data.known_length import (
     SHAPE_STD,
     parse_known_length,
@@ -24,7 +30,13 @@ from endoprior.data.known_length import (
 )
 from endoprior.data.scale import Scale
 from endoprior.data.scale_files import finish_scale, write_scale
-from endoprior.data.writer import SequenceMeta, new_sequence
+from endoprior.data.writer import FrameFiles, SequenceMeta, new_sequence
+from endoprior.prepare import prepare
+from endoprior.prepare.camera_path.tracks import CameraPath, PoseInput
+from endoprior.prepare.config import PrepareConfig
+from endoprior.prepare.folder_path import write_folder_path
+from endoprior.prepare.scale.apply import use_scale
+from endoprior.view.server import Viewer
 
 WIDTH, HEIGHT, COUNT = 64, 48, 4
 MATRIX = np.array([[80.0, 0, 32.0], [0, 80.0, 24.0], [0, 0, 1]])
@@ -195,8 +207,6 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_what_cannot_be_used_is_one_line_and_changes_nothing(folder, capsys, name):
     if name == "no depth":
-        from endoprior.data.images import save_png
-
         save_png(folder / "depth" / "000003.png", np.full((HEIGHT, WIDTH), 0, np.uint16))
     before, (options, message) = contents(folder), BAD[name]
     assert main(["scale", str(folder), *options]) == 2
@@ -206,8 +216,6 @@ def test_what_cannot_be_used_is_one_line_and_changes_nothing(folder, capsys, nam
 
 
 def test_folders_that_are_in_mm_or_without_tools(folder, capsys):
-    from endoprior.data.images import save_png
-
     for file in (folder / "masks").iterdir():
         save_png(file, np.zeros((HEIGHT, WIDTH), np.uint8))
     assert main(["scale", str(folder), "--shaft-mm", "8"]) == 2
@@ -245,3 +253,114 @@ def test_two_clicked_points_give_the_scale(folder):
     for wrong in (0.0, -1.0, 1e5):
         with pytest.raises(InputError, match="x: expected two points and a length above 0"):
             scale_between(points, camera, wrong, 1, None, "x")
+
+
+def source(tmp_path, count=4):
+    """A folder of images, and one of relative depth."""
+    rng = np.random.default_rng(1)
+    for i in range(count):
+        image = cv2.GaussianBlur(rng.integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8), (0, 0), 2)
+        image = np.clip(image * (1.3, 0.5, 0.5), 0, 255).astype(np.uint8)
+        for name, pixels in (("images", image), ("near", read(0)[0].astype(np.uint16))):
+            (tmp_path / name).mkdir(exist_ok=True)
+            save_png(tmp_path / name / f"{i:03d}.png", pixels)
+    options = {"depth": str(tmp_path / "near"), "depth_relative": "depth", "masks": "none", "border": "keep"}
+    return tmp_path / "images", PrepareConfig(poses="still", field_of_view_degrees=43.6, **options)
+
+
+def test_prepare_writes_mm_and_without_the_option_what_it_always_wrote(tmp_path):
+    images, cfg = source(tmp_path)
+    plain = prepare(images, tmp_path / "plain", cfg)
+    scaled = prepare(images, tmp_path / "scaled", replace(cfg, known_length=("1,12,24,52,24,25",)))
+    assert not any("scale" in name for name in described(plain.out) if name != "depth_scale")
+    assert described(plain.out)["depth_relative"] and described(plain.out)["depth_scale"] == 0.01
+    sequence, before = load_sequence(scaled.out), load_sequence(plain.out)
+    factor = sequence.scale.factor
+    assert sequence.scale.source == "known length in frame 1" and not sequence.depth_is_relative
+    assert sequence.frame(2).depth == pytest.approx(factor * before.frame(2).depth, rel=1e-5)
+    depth = sequence.frame(1).depth
+    assert depth[24, 12] * 40 / sequence.camera(0).fx == pytest.approx(25, rel=0.01)
+    note = next(note for note in scaled.notes if note.startswith("scale: "))
+    assert "lengths in mm err by 11%" in note and f"is {factor:.3g} mm" in note
+    for name in ("depth", "images", "masks"):
+        files = sorted((plain.out / name).iterdir())
+        assert [file.read_bytes() for file in files] == [(scaled.out / name / f.name).read_bytes() for f in files]
+    write_scale(plain.out, sequence.scale)  # what the command does, to the same end
+    now, then = ({k: v for k, v in described(each.out).items() if v is not None} for each in (plain, scaled))
+    assert now == then and np.allclose(*(np.load(each / "poses_bounds.npy") for each in (plain.out, scaled.out)))
+
+
+def test_prepare_rejects_what_cannot_be_used(tmp_path):
+    images, cfg = source(tmp_path)
+    mm = {"depth_relative": "no", "depth_unit_mm": 1.0, "known_length": (LENGTH,)}
+    with pytest.raises(InputError, match=r"--known-length: expected relative depth.*got depth in mm"):
+        prepare(images, tmp_path / "out", replace(cfg, **mm))
+    with pytest.raises(InputError, match="--known-length: expected FRAME,X1"):
+        replace(cfg, known_length=("1,2",))
+    with pytest.raises(InputError, match=r"--known-length: expected a frame in 0\.\.3, got 7 in"):
+        prepare(images, tmp_path / "out", replace(cfg, known_length=("7,12,24,52,24,25",)))
+    with pytest.raises(InputError, match="--shaft-mm: expected tools in the masks"):
+        prepare(images, tmp_path / "out", replace(cfg, shaft_mm=8.0))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_path_is_scaled_with_the_depth(folder):
+    meta = SequenceMeta(WIDTH, HEIGHT, 80, 80, 32, 24, 25.0, depth_relative=True)
+    files = FrameFiles(folder, meta, COUNT)
+    poses = np.stack([POSE] * COUNT)
+    path = CameraPath(poses, np.ones(COUNT, bool), np.ones(COUNT), translation_std=np.full(COUNT, 0.1))
+
+    def frame(index):
+        depth, tool = read(index)
+        return PoseInput(np.zeros((HEIGHT, WIDTH, 3), np.uint8), ~tool, depth)
+
+    assert use_scale(files, frame, path, (), 0.0) == (path, []) and files.meta is meta
+    scaled, notes = use_scale(files, frame, path, ("1,12,24,52,24,50",), 0.0)
+    factor = files.meta.scale.factor
+    assert scaled.camera_to_world[:, :3, 3] == pytest.approx(factor * poses[:, :3, 3]) and len(notes) == 1
+    assert np.array_equal(scaled.camera_to_world[:, :3, :3], poses[:, :3, :3]) and poses[0, 0, 3] == 1
+    record = json.loads((folder / "camera_path.json").read_text())
+    assert record["translation_std_mm"] == [round(0.1 * factor, 5)] * COUNT
+    assert files.meta.depth_scale == pytest.approx(0.01 * factor)
+
+
+def test_new_poses_that_change_depth_forget_the_scale(folder, monkeypatch):
+    write_scale(folder, Scale(2.5, 0.07, "known length in frame 1"))
+    found = CameraPath(np.stack([POSE] * COUNT), np.ones(COUNT, bool), np.full(COUNT, 1.1))
+    lenses = []
+
+    def moved(how, frame, views, count, lens, size, **_):
+        lenses.append(lens)
+        return (found if how == "own" else None), []
+
+    monkeypatch.setattr("endoprior.prepare.folder_path.sequence_path", moved)
+    static = write_folder_path(folder, "still")
+    assert load_sequence(folder).scale.factor == 2.5 and not static.relative
+    done = write_folder_path(folder, "own")
+    assert lenses[0].depth_is_relative, "its shape is a guess, in mm or not"
+    assert done.relative and load_sequence(folder).depth_is_relative and load_sequence(folder).scale is None
+    assert any("the scale (known length in frame 1) is lost" in note for note in done.notes)
+
+
+def test_the_viewer_writes_the_scale_of_two_clicks(folder, capfd):
+    viewable, _ = open_viewable(folder, None)
+    with at_work(Viewer(viewable)) as viewer:
+        panel, client = viewer.panel, Client(viewer.url)
+        client.send_camera()
+        client.set(panel.measure, True)
+        client.image()
+        client.set(panel.save_scale, True)
+        wait_until(lambda: "two points in one frame" in capfd.readouterr().err)
+        client.click(0.3, 0.5)
+        client.click(0.7, 0.5)
+        wait_until(lambda: viewer.measuring.measured is not None and viewer.measuring.measured.paths.shape[1] == 2)
+        units = viewer.measuring.measured.curve("Distance")[0]
+        client.set(panel.known_mm, 30.0)
+        time.sleep(1.1)  # saving is limited to once a second
+        client.set(panel.save_scale, True)
+        wait_until(lambda: "Saved: known length in frame 0" in panel.scaled.content)
+        client.socket.close()
+    assert load_sequence(folder).scale.factor == pytest.approx(30 / units)
+    assert open_viewable(folder, None)[0].can_scale, "it can be replaced"
+    (folder / "sequence.json").write_text(json.dumps({"fx": 80, "depth_scale": 0.01}))
+    assert not open_viewable(folder, None)[0].can_scale

@@ -22,7 +22,6 @@ from .find import SHAFT_OPTION, Frame, check_scale_options, find_scale
 
 def demand_no_unit(known_length: Sequence[str], shaft_mm: float, relative: bool) -> None:
     """Raise InputError if a scale is given for depth that is in mm already."""
-    check_scale_options(known_length, shaft_mm)
     if (known_length or shaft_mm) and not relative:
         option = "--known-length" if known_length else SHAFT_OPTION
         raise input_error(option, "relative depth, of a video with one eye", "depth in mm", f"remove {option}.")
