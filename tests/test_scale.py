@@ -22,6 +22,7 @@ from endoprior.data import load_sequence, scale_files
 from endoprior.data.images import save_png
 from endoprior.data.known_length import (
     SHAPE_STD,
+    length_std,
     parse_known_length,
     relative_length,
     robust_mean,
@@ -85,11 +86,12 @@ def read(index):
 
 
 def test_a_known_length_in_closed_form():
-    units, click = relative_length(parse_known_length(LENGTH), *read(1), MATRIX)
+    units, std = relative_length(parse_known_length(LENGTH), *read(1), MATRIX)
     # Pixel 24 covers 24..25, so that depth there is that of its center.
-    assert units == pytest.approx(40 / 80 * slanted(0, 24.5), rel=1e-6) and click == pytest.approx(
-        np.sqrt(2) * 1.5 / 40
-    )
+    assert units == pytest.approx(40 / 80 * slanted(0, 24.5), rel=1e-6)
+    relief = (0.08 * 80 / 40) ** 2 / 2
+    assert std == pytest.approx(np.sqrt(0.12**2 + 2 * (1.5 / 40) ** 2 + relief**2))
+    assert length_std(400, 600) < 0.125 and length_std(50, 600) > 0.4, "short lengths say little"
     down, _ = relative_length(parse_known_length("0,32,10.5,32,40.5,9"), *read(0), MATRIX)
     ends = [slanted(0, y) * np.array([0, (y - 24) / 80, 1]) for y in (10.5, 40.5)]
     assert down == pytest.approx(np.linalg.norm(ends[0] - ends[1]), rel=1e-5)
@@ -178,8 +180,10 @@ def test_the_command_says_what_a_unit_is_and_check_shows_it(folder, capsys):
     sequence = load_sequence(folder)
     facts = measure(sequence, DataConfig())
     rows = dict(table(facts))
-    assert rows["depth unit"].startswith("mm: known length in frame 1; lengths in mm err by 11%")
+    assert rows["depth unit"].startswith("mm: known length in frame 1; lengths in mm err by 13%")
     assert not {"relative-depth", "depth-unit"} & {finding.code for finding in find(facts)}
+    write_scale(folder, Scale(20.0, 0.1, "known length in frame 1"))  # 1 m away: the user said so
+    assert "depth-unit" not in {finding.code for finding in find(measure(load_sequence(folder), DataConfig()))}
     assert any("scale by known length in frame 1" in remark for remark in sequence.validate())
 
 
@@ -281,7 +285,7 @@ def test_prepare_writes_mm_and_without_the_option_what_it_always_wrote(tmp_path)
     depth = sequence.frame(1).depth
     assert depth[24, 12] * 40 / sequence.camera(0).fx == pytest.approx(25, rel=0.01)
     note = next(note for note in scaled.notes if note.startswith("scale: "))
-    assert "lengths in mm err by 11%" in note and f"is {factor:.3g} mm" in note
+    assert "lengths in mm err by 13%" in note and f"is {factor:.3g} mm" in note
     for name in ("depth", "images", "masks"):
         files = sorted((plain.out / name).iterdir())
         assert [file.read_bytes() for file in files] == [(scaled.out / name / f.name).read_bytes() for f in files]

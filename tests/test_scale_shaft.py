@@ -92,6 +92,8 @@ def test_a_round_border_and_tools_that_are_no_shafts():
     assert not list(shafts_of(outside, outside)) and not list(shafts_of(NOTHING, NOTHING))
     blob = x**2 + (y - 100) ** 2 < 60**2  # enters from the border, and is not straight
     assert not list(shafts_of(blob, NOTHING))
+    stub = (y > 70) & (np.abs(x) < 40)  # straight, and too short for its width
+    assert not list(shafts_of(stub, NOTHING))
     inner = (np.abs(x) < 80) & (np.abs(y) < 10)  # straight, and does not enter
     assert not list(shafts_of(inner, NOTHING))
 

@@ -18,8 +18,10 @@ FORM = "FRAME,X1,Y1,X2,Y2,MM"
 EXAMPLE = f"`{OPTION} 12,310,205,402,198,20`."
 WINDOW_PX = 2  # depth at a point is the median of the tissue within so many px
 CLICK_PX = 1.5  # standard deviation of a point's place
-SHAPE_STD = 0.1
-"""Standard deviation of the log of a length in relative depth of the right scale (docs/prepare.md)."""
+SHAPE_STD = 0.12
+"""Standard deviation of the log of a long length in relative depth of the right scale (docs/prepare.md)."""
+RELIEF_STD = 0.08
+"""Relief that relative depth misses between two points: standard deviation of its ratio to their distance."""
 PRIOR_WEIGHT = 2.0  # lengths that `SHAPE_STD` counts as, beside the spread of those that are given
 MOST_MM = 1000.0
 ROUNDS = 20
@@ -61,7 +63,7 @@ def parse_known_length(text: str, option: str = OPTION) -> KnownLength:
 def relative_length(
     length: KnownLength, depth: NDArray, tools: NDArray[np.bool_], matrix: NDArray, option: str = OPTION
 ) -> tuple[float, float]:
-    """The distance of the two points in the units of the depth, and its relative standard deviation by the clicks.
+    """The distance of the two points in the units of the depth, and its relative standard deviation (`length_std`).
 
     |z1 K^-1 (x1, y1, 1) - z2 K^-1 (x2, y2, 1)|, with z the median depth of tissue around a point.
 
@@ -86,7 +88,17 @@ def relative_length(
             raise input_error(option, "points with depth", f"none at {named}", "choose other points.")
         points.append(np.median(around) * np.linalg.solve(matrix, [x, y, 1.0]))
     pixels = float(np.hypot(*np.subtract(length.first, length.second)))
-    return float(np.linalg.norm(points[0] - points[1])), float(np.sqrt(2) * CLICK_PX / pixels)
+    return float(np.linalg.norm(points[0] - points[1])), length_std(pixels, float(matrix[0, 0]))
+
+
+def length_std(pixels: float, focal: float) -> float:
+    """Standard deviation of the log of a length that is so many px long in the image. `focal` length, px.
+
+    A length l at distance z is l f / z px long. Relief of r z that is missed makes it longer, sqrt(l^2 + (r z)^2), by
+    about (r f / px)^2 / 2 of it: short lengths say little. Both points are clicked within `CLICK_PX`.
+    """
+    relief = (RELIEF_STD * focal / pixels) ** 2 / 2
+    return float(np.sqrt(SHAPE_STD**2 + relief**2 + 2 * (CLICK_PX / pixels) ** 2))
 
 
 def scale_by_lengths(
@@ -103,16 +115,16 @@ def scale_by_lengths(
     Raises:
         InputError: a frame or a point that there is not, or a scale that cannot be.
     """
-    logs, clicks = [], []
+    logs, stds = [], []
     for length in lengths:
         if not 0 <= length.frame < count:
             raise input_error(option, f"a frame in 0..{count - 1}", f"{length.frame} in {length.text}", EXAMPLE)
-        units, click = relative_length(length, *read(length.frame), matrix, option)
+        units, std = relative_length(length, *read(length.frame), matrix, option)
         if not units > 0:
             raise input_error(option, "points that are apart", length.text, EXAMPLE)
         logs.append(np.log(length.mm / units))
-        clicks.append(click)
-    mean, error = robust_mean(np.array(logs), np.hypot(clicks, SHAPE_STD))
+        stds.append(std)
+    mean, error = robust_mean(np.array(logs), np.array(stds))
     factor = float(np.exp(mean))
     demand_plausible(option, factor)
     frames = sorted({length.frame for length in lengths})
@@ -139,8 +151,7 @@ def scale_between(
         raise input_error(what, f"two points and a length above 0, up to {MOST_MM:g} mm", got, "enter the length.")
     pixels = float(np.linalg.norm(np.subtract(*project(points, camera)[0])))
     demand_plausible(what, mm / units * factor)
-    error = float(np.hypot(SHAPE_STD, np.sqrt(2) * CLICK_PX / max(pixels, 1.0)))
-    return Scale(mm / units * factor, error, f"known length in frame {frame}")
+    return Scale(mm / units * factor, length_std(max(pixels, 1.0), camera.fx), f"known length in frame {frame}")
 
 
 def robust_mean(values: NDArray[np.float64], stds: NDArray[np.float64]) -> tuple[float, float]:

@@ -33,6 +33,8 @@ WIDE = 4.0  # range of log s in which those are
 GAPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)  # means of g that are tried
 SHAPE_STD = 0.06
 """Standard deviation of log relative depth against that of other places: 0.04 to 0.07 for shading (docs/prepare.md)."""
+COMMON_STD = 0.12
+"""Standard deviation of what all readings share: a wrist always bent to one side, shadows beside the shaft."""
 STEPS = 2000
 
 
@@ -93,7 +95,7 @@ def frontier(readings: Sequence[TipReading], width: int) -> tuple[float, float]:
     weight = np.exp(log_posterior - log_posterior.max())
     weight /= weight.sum()
     mean = float(weight @ grid)
-    return mean, float(np.hypot(np.sqrt(weight @ (grid - mean) ** 2), SHAPE_STD))
+    return mean, float(np.hypot(np.sqrt(weight @ (grid - mean) ** 2), COMMON_STD))
 
 
 def _tip_depth(edges: ShaftEdges, matrix: NDArray, radius_mm: float) -> tuple[float, float] | None:
