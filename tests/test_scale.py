@@ -37,7 +37,9 @@ from endoprior.prepare.camera_path.tracks import CameraPath, PoseInput
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.folder_path import write_folder_path
 from endoprior.prepare.scale.apply import use_scale
+from endoprior.view.panel import status
 from endoprior.view.server import Viewer
+from endoprior.view.viewable import ViewSettings
 
 WIDTH, HEIGHT, COUNT = 64, 48, 4
 MATRIX = np.array([[80.0, 0, 32.0], [0, 80.0, 24.0], [0, 0, 1]])
@@ -300,7 +302,7 @@ def test_prepare_rejects_what_cannot_be_used(tmp_path):
     with pytest.raises(InputError, match=r"--known-length: expected relative depth.*got depth in mm"):
         prepare(images, tmp_path / "out", replace(cfg, **mm))
     with pytest.raises(InputError, match="--known-length: expected FRAME,X1"):
-        replace(cfg, known_length=("1,2",))
+        prepare(tmp_path / "none", tmp_path / "out", replace(cfg, known_length=("1,2",)))
     with pytest.raises(InputError, match=r"--known-length: expected a frame in 0\.\.3, got 7 in"):
         prepare(images, tmp_path / "out", replace(cfg, known_length=("7,12,24,52,24,25",)))
     with pytest.raises(InputError, match="--shaft-mm: expected tools in the masks"):
@@ -365,6 +367,10 @@ def test_the_viewer_writes_the_scale_of_two_clicks(folder, capfd):
         wait_until(lambda: "Saved: known length in frame 0" in panel.scaled.content)
         client.socket.close()
     assert load_sequence(folder).scale.factor == pytest.approx(30 / units)
-    assert open_viewable(folder, None)[0].can_scale, "it can be replaced"
+    again = open_viewable(folder, None)[0]
+    assert again.can_scale and not again.relative, "it can be replaced"
+    assert "known length in frame 0; lengths in mm err by" in status(again, ViewSettings(layer="frame"), 0).replace(
+        "\\", ""
+    )
     (folder / "sequence.json").write_text(json.dumps({"fx": 80, "depth_scale": 0.01}))
     assert not open_viewable(folder, None)[0].can_scale

@@ -126,10 +126,6 @@ class PrepareConfig:
     """Also write the images of the right camera to `right/`."""
 
     def __post_init__(self) -> None:
-        if self.known_length or self.shaft_mm:
-            from .scale.find import check_scale_options  # not before: help pages are quick
-
-            check_scale_options(self.known_length, self.shaft_mm)
         if self.stir is not None and self.depth == "none":
             raise ValueError("stir needs depth, got --depth none")
         for name, low, high in (

@@ -34,6 +34,7 @@ from .frame_geometry import FrameGeometry, with_equal_rows
 from .frame_tools import masked_frames
 from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
 from .scale.apply import demand_no_unit, use_scale
+from .scale.find import check_scale_options
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -91,6 +92,7 @@ def prepare(
         InputError: the video, or a file named by an option, cannot be used; nothing is left behind.
     """
     cfg, facts = cfg or PrepareConfig(), facts or KnownFacts()
+    check_scale_options(cfg.known_length, cfg.shaft_mm)
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
         _demand_all_frames(cfg)

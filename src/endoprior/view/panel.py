@@ -181,6 +181,8 @@ def status(viewable: Viewable, settings: ViewSettings, num_kept: int) -> str:
         lines.append("Tool masks are corrected in the endoscope view.")
     if viewable.relative:
         lines.append("Depth is **relative**: lengths are not mm.")
+    if viewable.scale_text:
+        lines.append(f"Scale: {plain(viewable.scale_text)}.")
     if num_kept:
         lines.append(f"{num_kept} saved views")
     return "  \n".join(lines)

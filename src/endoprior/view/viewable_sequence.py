@@ -36,6 +36,7 @@ class ViewableSequence:
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         self.frames_per_second = sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND
         self.relative = sequence.depth_is_relative
+        self.scale_text = "" if sequence.scale is None else sequence.scale.text
         self.can_scale = sequence.depth_is_guessed and (sequence.path / "sequence.json").is_file()
         self._masks = MaskEdits(sequence)
         self.mask_edits = self._masks if sequence.mask_files else None
