@@ -21,6 +21,7 @@ from ..data.description import PrepareRecord, read_description, read_record
 from ..data.files import in_order
 from ..data.found_tools import UNCERTAIN, read_rows
 from ..data.images import read_color
+from ..data.scale import Scale
 from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion
@@ -111,6 +112,7 @@ class DepthFacts:
     scale: float  # mm per stored unit: the option, else the value in `sequence.json`, else 1
     unit: UnitGuess
     relative: bool  # whether the folder states that its scale is unknown
+    known: Scale | None = None  # how relative depth was brought to mm
 
 
 @dataclass(frozen=True)
@@ -319,6 +321,7 @@ def _depth(
         scale=float(cfg.depth_unit_mm or described.get("depth_scale") or 1.0),
         unit=guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in pairs),
         relative=sequence.depth_is_relative,
+        known=sequence.scale,
     )
 
 
@@ -333,7 +336,7 @@ def _pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
     matrix = np.array([[first.fx, 0, first.cx - 0.5], [0, first.fy, first.cy - 0.5], [0, 0, 1]])
     stored = np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))])
     poses = np.linalg.inv(stored).astype(np.float64)
-    return measure_poses(view, matrix, poses, relative=sequence.depth_is_relative, each=each)
+    return measure_poses(view, matrix, poses, relative=sequence.depth_is_guessed, each=each)
 
 
 def _stereo(sequence: FrameSequence) -> StereoFacts | None:

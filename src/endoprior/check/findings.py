@@ -140,7 +140,8 @@ def _depth(facts: Facts) -> Iterator[Finding]:
         what = f"8 bits a value, steps of {depth.step:.3g}{known}"
         yield Finding("depth-8-bit", "warning", what, f"export {path}/depth as 16-bit PNG{or_again}")
     if depth.relative:
-        fix = "nothing for rendering; for lengths in mm use a stereo video or measured depth"
+        known = command("scale", facts.path, "--known-length", "FRAME,X1,Y1,X2,Y2,MM")
+        fix = f"nothing for rendering; for lengths in mm `{known}`"
         yield Finding("relative-depth", "note", "the scale of the depth is unknown or assumed", fix)
     beyond = tuple(int(i) for i in np.flatnonzero(depth.far > FAR_SHARE))
     if beyond and unit.unit == "mm" and not depth.relative:
@@ -163,7 +164,7 @@ def _unit(facts: Facts) -> Iterator[Finding]:
         fix = "store depth in mm: focal length (px) x baseline (mm) / disparity (px)"
         fix += ", or run `prepare` with `--depth-relative disparity` for relative depth"
         yield Finding("depth-disparity", "error", unit.reason, fix)
-    elif facts.depth.relative or unit.unit in ("mm", "none"):
+    elif facts.depth.relative or facts.depth.known or unit.unit in ("mm", "none"):
         return
     elif unit.mm_per_unit is None:
         fix = f"{_set_values(facts, depth_scale='MM_PER_UNIT')}, so that the tissue is some 20 to 250 mm away"

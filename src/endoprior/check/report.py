@@ -39,7 +39,7 @@ def table(facts: Facts) -> list[tuple[str, str]]:
         (
             "depth",
             f"{depth.low:.4g} to {depth.high:.4g}, median {depth.unit.median:.4g} {unit}"
-            f"{'' if depth.relative else ', if the unit is right'}",
+            f"{'' if depth.relative or depth.known else ', if the unit is right'}",
         ),
         ("depth unit", f"{depth.unit.unit if _unit_is_guessed(facts) else unit}: {unit_reason(facts)}"),
         (
@@ -72,11 +72,13 @@ def as_json(facts: Facts, findings: list[Finding]) -> dict[str, Any]:
 
 def unit_reason(facts: Facts) -> str:
     """Why the depth has the unit that it seems to have."""
+    if facts.depth.known is not None:
+        return facts.depth.known.text
     return facts.depth.unit.reason if _unit_is_guessed(facts) else "its scale is unknown or assumed"
 
 
 def _unit_is_guessed(facts: Facts) -> bool:
-    return not facts.depth.relative or facts.depth.unit.unit == "disparity"
+    return not (facts.depth.relative or facts.depth.known) or facts.depth.unit.unit == "disparity"
 
 
 def _camera_words(facts: Facts) -> str:

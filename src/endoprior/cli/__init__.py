@@ -30,6 +30,7 @@ COMMANDS = {
     "prepare": ("prepare", "write a sequence folder from a video: rectified frames, depth, tool masks, poses"),
     "masks": ("masks", "find the tools in a sequence folder and write their masks"),
     "poses": ("prepare", "find the camera path of a sequence folder and write its poses"),
+    "scale": ("scale", "bring relative depth to mm, by a known length or an instrument's diameter"),
     "check": ("check", "check a sequence before training: properties, problems with their fix, a figure"),
     "prior": ("check", "write the cue maps and the joint texture prior of each frame"),
     "train": ("train", "train one scene and score it"),

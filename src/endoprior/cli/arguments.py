@@ -201,11 +201,11 @@ def _taken(option: Option, name: str) -> dict[str, Any]:
         return {"action": "store_false" if name == option.off else "store_true"}
     if option.choices or get_origin(option.kind) is Literal:
         return {"choices": option.choices or get_args(option.kind), "metavar": option.metavar}
-    kind, count = option.kind, None
+    kind, count, action = option.kind, None, "store"
     if get_origin(kind) is tuple:
         kind, *others = get_args(kind)
-        count = "*" if others == [...] else 1 + len(others)
-    return {"type": kind, "nargs": count, "metavar": option.metavar or kind.__name__.upper()}
+        count, action = ("*", "extend") if others == [...] else (1 + len(others), "store")  # given again: more values
+    return {"action": action, "type": kind, "nargs": count, "metavar": option.metavar or kind.__name__.upper()}
 
 
 def _default(one: Field, defaults: Mapping[str, Any]) -> Any:

@@ -66,7 +66,7 @@ def assemble(
             reliable, because it was measured or rendered.
         confidence: of the depth of kept frame i, see `Frame.depth_confidence`.
         right_eye, mask_folder, mask_files, new_mask_files: see `FrameSequence`; at full size.
-        about: `frames_per_second`, `truth`, `remarks`, `mask_tool_value`, `depth_is_relative`, `sources` of
+        about: `frames_per_second`, `truth`, `remarks`, `mask_tool_value`, `depth_is_relative`, `scale`, `sources` of
             `FrameSequence`.
     Raises:
         InputError: fewer than 2 frames or no pixel would be left, or a camera has impossible numbers.

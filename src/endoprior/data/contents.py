@@ -84,6 +84,8 @@ def remarks_on(sequence: FrameSequence, decoded: Callable[[int], Frame]) -> list
         remarks.append(f"{masks}: {tool:.0%} of all pixels are masked; the polarity may be inverted")
     if sequence.depth_is_relative:
         remarks.append(f"{sequence.path}: the scale of its depth is unknown or assumed; lengths are not millimeters")
+    if sequence.scale is not None:
+        remarks.append(f"{sequence.path}: scale by {sequence.scale.text}")
     if empty := [index for index in range(count) if not with_both[index]]:
         remarks.append(f"{sequence.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
     return remarks

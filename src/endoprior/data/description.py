@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..core.config_io import from_dict
-from ..core.shell import Options
+from ..core.shell import Options, command
 from ..system.atomic import write_json
 from .files import read_json
 
@@ -37,6 +37,10 @@ def is_number(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, int | float) and LEAST <= value <= MOST
 
 
+def _is_share(value: Any, most: float) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float) and 0 <= value <= most
+
+
 def _is_all(value: Any, kind: type, of: type) -> bool:
     """Whether a value is a list or a dict, and all in it are of one type; a bool is no int."""
     return type(value) is kind and all(type(each) is of for each in (value.values() if kind is dict else value))
@@ -48,6 +52,9 @@ KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
     "depth_unit": ("mm", lambda unit: unit == "mm", "give mm, and mm per stored unit as depth_scale."),
     "mask_tool_value": ("255 or 0", lambda value: value in (0, 255), "give the one that marks tools."),
     "depth_relative": ("true or false", lambda value: isinstance(value, bool), CORRECT),
+    "scale_factor": (f"to be a number in [{LEAST:g}, {MOST:g}]", is_number, CORRECT),
+    "scale_error": ("to be a number in [0, 10]", lambda value: _is_share(value, 10), CORRECT),
+    "scale_source": ("to be a text", lambda value: isinstance(value, str) and 0 < len(value) <= 300, CORRECT),
     "sources": ("to map names to texts", lambda value: _is_all(value, dict, str), CORRECT),
     "unexplained_frames": ("to be a list of frame numbers", lambda value: _is_all(value, list, int), CORRECT),
     "frame_weights": (
@@ -63,11 +70,18 @@ KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
 }
 """What is expected of each key, whether a value is that, and the fix."""
 RECORD = "prepare.json"
+PATH_RECORD = "camera_path.json"  # in a sequence folder: how each pose was found, and how sure it is
+SCALED = ("scale_factor", "scale_error", "scale_source")
+"""Keys of a sequence whose relative depth was brought to mm (`data.scale`): all, or none."""
+SCALE_PENDING = "scale_pending"  # folder of what is being moved to its place when relative depth gets a scale
 STEPS, NEAR_PX = 40, 0.5  # to find a source point in the frame, and how near they end, px, unless it lies outside
 
 
 def read_description(path: Path) -> dict[str, Any]:
     """The checked contents of `sequence.json`, or an empty dict when there is none. Unknown keys are kept."""
+    if (path.parent / SCALE_PENDING).is_dir():
+        fix = f"finish it: `{command('scale', path.parent)}`."
+        raise input_error(path.parent, "a complete folder", "one whose change of scale was interrupted", fix)
     if not path.exists():
         return {}
     described = {key: value for key, value in read_json(path).items() if value is not None}

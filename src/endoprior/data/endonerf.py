@@ -34,6 +34,7 @@ from .images import (
 )
 from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, scale_of, world_to_camera
 from .reading import read_numpy
+from .scale import described_scale
 from .sequence import FrameSequence, is_test_frame
 from .truth import Truth, open_right_eye
 
@@ -134,6 +135,7 @@ def load_endonerf(
         new_mask_files=new_masks,
         mask_tool_value=tool_value,
         depth_is_relative=relative,
+        scale=described_scale(path / "sequence.json", described),
         sources=described.get("sources") or {},
         frame_weights=weights[kept],
         confidence=(lambda index: read_share(sureness[index], size)) if sureness else None,

@@ -21,6 +21,7 @@ from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes
 from .contents import demand_same, fingerprint_of, remarks_on, state_of, weighted
 from .description import ESTIMATED_POSES, TOOLS_FOUND
+from .scale import Scale
 from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]
@@ -81,6 +82,8 @@ class FrameSequence:
     """Value of tools in these files, 255 or 0."""
     depth_is_relative: bool = False
     """The scale of depth is unknown or assumed, so that lengths are not in mm."""
+    scale: Scale | None = None
+    """How relative depth was brought to mm; None if it was measured in mm, or is relative."""
     sources: dict[str, str] = field(default_factory=dict)
     """Origin of each part, such as {"depth": "stereo"}."""
     frame_weights: NDArray[np.float64] | None = None
@@ -100,6 +103,11 @@ class FrameSequence:
     def masks_are_found(self) -> bool:
         """Whether a program found the tools, rather than a person."""
         return TOOLS_FOUND in self.sources.get("masks", "")
+
+    @property
+    def depth_is_guessed(self) -> bool:
+        """Whether depth is a guess from one eye, in a unit or not: its shape was not measured."""
+        return self.depth_is_relative or self.scale is not None
 
     @property
     def poses_are_estimated(self) -> bool:

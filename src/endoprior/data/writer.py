@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from ..core.checks import input_error
 from ..system.atomic import remove_leftovers, temporary_sibling, whole_file, whole_folder, write_json
 from .description import TOOLS_FOUND, read_description
 from .images import decode_image, encode_png, read_tool_mask, save_png
+from .scale import Scale
 from .sequence import FrameSequence
 
 NOTE = "changes.json"  # In the folder of the original masks: the files that were changed, and by how many pixels
@@ -163,6 +164,7 @@ class SequenceMeta:
     depth_scale: float = 0.01  # mm per unit of the 16-bit depth PNG
     depth_source: str | None = None  # origin of the depth, for example `stereo`; None without depth
     depth_relative: bool = False  # whether the depth's scale is assumed, so that lengths are not millimeters
+    scale: Scale | None = None  # how relative depth was brought to mm: then `depth_scale` has its factor in it
     sources: dict[str, str] = field(default_factory=dict)  # origin of each part; no paths, which may hold names
     note: str = ""  # for users of the sequence
 
@@ -262,7 +264,11 @@ class FrameFiles:
         bounds = np.array([depth_bounds(each, meta.depth_scale) for each in stored])
         self.write_array("poses_bounds.npy", pose_table(cameras, meta.height, meta.width, meta.fx, bounds))
         fixed = {"format_version": 1, "depth_unit": "mm", "mask_tool_value": TOOL_VALUE}
-        described = fixed | asdict(meta) | {"unexplained_frames": [*unexplained_frames]}
+        known = asdict(replace(meta, scale=None))
+        del known["scale"]
+        described = fixed | known | {"unexplained_frames": [*unexplained_frames]}
+        if meta.scale is not None:
+            described |= meta.scale.described
         if min(frame_weights, default=1) < 1:
             described["frame_weights"] = [round(float(weight), 3) for weight in frame_weights]
         self.write_json("sequence.json", described)

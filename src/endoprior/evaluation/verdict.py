@@ -41,7 +41,7 @@ class Facts:
     share_used: float = 1.0
     """Share of the frames of the chosen part that were trained on or scored, 0..1."""
     share_with_missed_tools: float = 0.0
-    depth_is_relative: bool = False
+    depth_is_guessed: bool = False
     """Depth is guessed from one eye."""
     motion_is_unknown: bool = False
     """The camera moves, or may move, and its path was not found."""
@@ -115,7 +115,7 @@ def _depth(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, str
     if (relief := scores.get("depth_relief", 1.0)) < RELIEF:
         told = f"(correlation {relief:.2f})"
         yield DOUBTFUL, f"depth does not rise and fall as the moving camera triangulates it {told}"
-    if error is None and facts.depth_is_relative:
+    if error is None and facts.depth_is_guessed:
         yield USABLE, "depth is a guess from one eye that nothing confirms: do not trust views from the side"
 
 

@@ -192,7 +192,7 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
     is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
     codes = tuple(finding["code"] for finding in read_json(job.findings)["findings"])
-    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_relative, is_unknown, codes)
+    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_guessed, is_unknown, codes)
     result.verdict = verdict_on(result.scores, facts)
     result.save(job.run)
     title = [PREVIEW_TITLE] * job.is_preview + wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)

@@ -100,6 +100,11 @@ class PrepareConfig:
     """The depth folder holds relative depth, or relative disparity (near is large), of a network."""
     working_distance_mm: float = 70.0
     """Relative depth is scaled to this median, mm."""
+    known_length: tuple[str, ...] = field(default=(), metadata={"metavar": "FRAME,X1,Y1,X2,Y2,MM"})
+    """Relative depth gets mm: two points of tissue, x, y in px of the written frame, are MM apart. One or more."""
+    shaft_mm: float = field(default=0.0, metadata={"metavar": "MM"})
+    """Relative depth gets mm: diameter of all instruments' shafts, most often 8 in robotic surgery, else 5. Their tips
+    must touch tissue in some frames. Less sure than --known-length."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
     masks: str = "auto"

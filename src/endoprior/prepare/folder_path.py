@@ -11,18 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.description import ESTIMATED_POSES, intrinsics_of, read_description
+from ..data.description import ESTIMATED_POSES, PATH_RECORD, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
 from ..data.files import list_files
 from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
+from ..data.scale import described_scale, without_scale
 from ..data.writer import POSES, demand_writable, depth_bounds, pose_table, replace_depth, replace_poses
 from ..footage.changes import find_changes
 from ..system.atomic import write_json
-from .camera_path.sequence_path import AS_OURS, ASSUMED, PATH_RECORD, Reading, path_depth, sequence_path
+from .camera_path.sequence_path import AS_OURS, ASSUMED, Reading, path_depth, sequence_path
 from .camera_path.tracks import MOTION, REFINED, CameraPath, Lens, PoseInput
 
 STATIC = "static camera"
+SCALE_AGAIN = "To have mm, give it again: `endoprior scale DATA --known-length FRAME,X1,Y1,X2,Y2,MM`"
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ def write_folder_path(
     demand_writable(folder)
     images = list_files(folder / "images", (".png",), "EndoNeRF")
     names = [file.stem for file in images]
-    masks, depths = (_of_all_images(folder / part, names) for part in ("masks", "depth"))
+    masks, depths = (of_all_images(folder / part, names) for part in ("masks", "depth"))
     described = read_description(folder / "sequence.json")
     height, width = read_color(images[0]).shape[:2]
     size, scale = (width, height), float(described.get("depth_scale", 1.0))
@@ -64,6 +66,8 @@ def write_folder_path(
     fx, fy, cx, cy = intrinsics_of(folder / "sequence.json", described, width, height, focal)
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     tool_value, relative = described.get("mask_tool_value", 255), described.get("depth_relative", False)
+    known = described_scale(folder / "sequence.json", described)
+    guessed = relative or known is not None  # each frame's depth has a scale of its own, whether its unit is mm or not
     sources, count = described.get("sources", {}), len(images)
 
     def color(index: int) -> NDArray[np.uint8]:
@@ -77,7 +81,7 @@ def write_folder_path(
         lambda i: PoseInput(color(i), tissue(i), read_depth(depths[i], scale, size)),
         lambda: (map(color, range(count)), map(tissue, range(count))),
         count,
-        Lens.centered_at_half(matrix, width, relative, described.get("baseline_mm")),
+        Lens.centered_at_half(matrix, width, guessed, described.get("baseline_mm")),
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
@@ -87,6 +91,10 @@ def write_folder_path(
     lost = path.lost if path else list[int]()
     unexplained = sorted({*lost, *find_changes(map(color, range(count))).off_color})
     new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
+    if known is not None and path is not None:
+        notes.append(f"frames get other depth: the scale ({known.source}) is lost. {SCALE_AGAIN}")
+        relative, described = True, without_scale(described)
+        write_json(folder / "sequence.json", described)  # before the depth that it is wrong for
     if relative and path is not None:
         shaped = enumerate(depths)
         replace_depth(folder, ((f.name, path_depth(path, i, decode_image(f, size), scale)) for i, f in shaped))
@@ -103,7 +111,7 @@ def write_folder_path(
     return FolderPath(new.camera_to_world, relative, unexplained, kept, notes)
 
 
-def _of_all_images(folder: Path, names: list[str]) -> list[Path]:
+def of_all_images(folder: Path, names: list[str]) -> list[Path]:
     """The file in a folder of each image, of these names without suffixes."""
     files = list_files(folder, (".png",), "EndoNeRF")
     matched = match_names(folder, [file.name for file in files], range(len(names)), names)

@@ -87,10 +87,11 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
         else:
             measure = _scaled(measure, samples, usable, cfg)
-        notes.append(
-            f"depth is relative ({source}), with its median set to {cfg.working_distance_mm:g}: lengths have no unit "
-            "(rel.). For mm use a stereo video or measured depth."
-        )
+        if not (cfg.known_length or cfg.shaft_mm):
+            notes.append(
+                f"depth is relative ({source}), with its median set to {cfg.working_distance_mm:g}: lengths have no "
+                "unit (rel.). For mm use --known-length, a stereo video or measured depth."
+            )
     elif kind == "folder" and measure is not None:
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.guess)
     wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])

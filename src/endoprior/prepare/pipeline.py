@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..core.shell import changed_options, command
 from ..data import write_stir_tracks
-from ..data.description import SIZE_NOT_STATED, PrepareRecord
+from ..data.description import PATH_RECORD, SIZE_NOT_STATED, PrepareRecord
 from ..data.files import CONFIDENCE
 from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncertain_frames
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
@@ -27,7 +27,7 @@ from ..system.memory import BoundedCache, cache_bytes
 from ..system.parallel import frame_threads
 from .calibration import parse_size
 from .calibration_files import read_calibration
-from .camera_path.sequence_path import ASSUMED, CALIBRATED, PATH_RECORD, Reading, path_depth, sequence_path
+from .camera_path.sequence_path import ASSUMED, CALIBRATED, Reading, path_depth, sequence_path
 from .camera_path.tracks import CameraPath, Lens, PoseInput
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
@@ -35,6 +35,8 @@ from .frame_geometry import FrameGeometry, with_equal_rows
 from .frame_tools import masked_frames
 from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
 from .parallax.measure import measure_depth
+from .scale.apply import demand_no_unit, use_scale
+from .scale.find import check_scale_options
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -92,6 +94,7 @@ def prepare(
         InputError: the video, or a file named by an option, cannot be used; nothing is left behind.
     """
     cfg, facts = cfg or PrepareConfig(), facts or KnownFacts()
+    check_scale_options(cfg.known_length, cfg.shaft_mm)
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
         _demand_all_frames(cfg)
@@ -106,6 +109,7 @@ def prepare(
         inside = first_pass.geometry.inside
         progress("looking at tools and light", 0, len(first_pass.indices))
         methods = choose_methods(cfg, clip, first_pass)
+        demand_no_unit(cfg.known_length, cfg.shaft_mm, methods.relative)
         files, used = _write(folder, cfg, clip, first_pass, methods, step, progress)
         first_pass.frames = None  # they are written now
         if files.count < 2:
@@ -127,6 +131,7 @@ def prepare(
         if path is not None:
             _use_path(files, path)
         motion_notes += _use_parallax(video, cfg, files, path, progress)
+        path, scale_notes = use_scale(files, files.pose_input, path, cfg.known_length, cfg.shaft_mm)
         shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
         RowLog(folder).remove()
         files.finish(None if path is None else path.camera_to_world, unexplained, weights.tolist())
@@ -137,7 +142,7 @@ def prepare(
         others = sorted({*unexplained} - {*damaged})
         if path is not None and path.is_unknown and not path.explained.any():
             others = []  # the note on the motion says it
-        notes = [*video_notes, *first_pass.notes, *methods.notes, *carried_notes, *motion_notes]
+        notes = [*video_notes, *first_pass.notes, *methods.notes, *carried_notes, *motion_notes, *scale_notes]
         notes += _advice(out, uncertain_frames(read_rows(folder)), moving, others, files.count - len(unexplained))
     return Prepared(out, files.count, first_pass.geometry.size, notes)
 

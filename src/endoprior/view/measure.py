@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from ..core.geometry import back_project, length_unit
 from ..core.types import Camera
 from ..model.carry import CarriedPoints
@@ -140,6 +141,19 @@ class Measuring:
             return None
         unit = length_unit(viewable.relative)
         return measures_csv(self.measured.measures, viewable.frames_per_second, unit, confidence)
+
+    def save_scale(self, viewable: Viewable) -> None:
+        """Write the scale at which the measured distance has the length in the panel, and say so there.
+
+        Raises:
+            InputError: no distance in one frame was measured, no length was given, or the folder cannot be written.
+        """
+        points = [point for point, _ in self._picked]
+        save, frames = viewable.save_scale, {frame for _, frame in self._picked}
+        if save is None or len(points) != 2 or len(frames) > 1:
+            fix = "check Measure by clicking, and click both ends of a known length in one frame."
+            raise input_error("Known length, mm", "two points in one frame", f"{len(points)}", fix)
+        self._panel.scaled.content = save(np.stack(points), frames.pop(), float(self._panel.known_mm.value))
 
     def lines(self, frame: int) -> Lines:
         return ruler(self.measured.ends(frame, self._panel.quantity.value)) if self.measured else NO_LINES

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from ..core.geometry import length_unit
+from ..data.known_length import MOST_MM
 from .access_control import are_numbers
 from .viewable import Layer, ViewSettings
 
@@ -94,6 +95,11 @@ class Panel:
             self.clear = gui.add_button("Clear measurement")
             self.table = gui.add_button("Save table (CSV)", hint="Every quantity of the points, in all frames.")
             self.distance = gui.add_markdown("")
+            scalable = viewable.can_scale
+            hint = "Measure a distance of this length. All lengths of the folder become mm."
+            self.known_mm = gui.add_number("Known length, mm", 0.0, min=0.0, max=MOST_MM, visible=scalable, hint=hint)
+            self.save_scale = gui.add_button("Save scale", visible=scalable)
+            self.scaled = gui.add_markdown("", visible=scalable)
             series = (uplot.Series(label="frame"), uplot.Series(label="measured", stroke="orange", width=2))
             scales, empty = {"x": uplot.Scale(time=False)}, (np.arange(float(total)), np.zeros(total))
             self.chart = gui.add_uplot(empty, series, scales=scales, height=160, visible=False)
@@ -175,6 +181,8 @@ def status(viewable: Viewable, settings: ViewSettings, num_kept: int) -> str:
         lines.append("Tool masks are corrected in the endoscope view.")
     if viewable.relative:
         lines.append("Depth is **relative**: lengths are not mm.")
+    if viewable.scale_text:
+        lines.append(f"Scale: {plain(viewable.scale_text)}.")
     if num_kept:
         lines.append(f"{num_kept} saved views")
     return "  \n".join(lines)

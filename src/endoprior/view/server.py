@@ -195,6 +195,7 @@ class Viewer:
         on_press(self._keep_view, controls.keep)
         on_press(lambda _client: self._then_update(self.kept_views.clear), controls.forget)
         on_save(self._save_table, controls.table)
+        on_save(lambda _client: self.measuring.save_scale(self.viewable), controls.save_scale)
         on_save(self._screenshot, controls.screenshot)
         on_save(self._save_video, controls.video)
         if editor := self._editor:

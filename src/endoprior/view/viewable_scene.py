@@ -63,6 +63,7 @@ class ViewableScene:
             self.layers += ("support", "frame", "difference")
         self.cameras, self.frames_per_second = scene.cameras, scene.frames_per_second
         self.relative = scene.lengths_are_relative
+        self.can_scale, self.save_scale, self.scale_text = False, None, ""  # a scale must be there before training
         self.has_tool, self.mask_edits = sequence is not None, None
         self.has_smoke = any(window.scene.smoke is not None for window in scene.windows)
         self._playback, self._rasterize = Playback(scene), render.load(scene.backend)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from ..core.geometry import back_project, camera_to_world, length_unit, pixel_centers
 from ..core.types import Camera
 from ..data import FrameSequence
+from ..data.known_length import scale_between
+from ..data.scale_files import write_scale
 from ..model.carry import CarriedPoints
 from ..priors import joint_texture_prior
 from ..visualization.image_tools import colorize
@@ -34,6 +36,8 @@ class ViewableSequence:
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         self.frames_per_second = sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND
         self.relative = sequence.depth_is_relative
+        self.scale_text = "" if sequence.scale is None else sequence.scale.text
+        self.can_scale = sequence.depth_is_guessed and (sequence.path / "sequence.json").is_file()
         self._masks = MaskEdits(sequence)
         self.mask_edits = self._masks if sequence.mask_files else None
 
@@ -72,6 +76,21 @@ class ViewableSequence:
         frame = self.sequence.frame(settings.frame)
         depth = frame.depth * (frame.depth_valid & (frame.depth >= settings.near) & (frame.depth <= settings.far))
         return layers.fitted(depth.astype(np.float32), camera)
+
+    def save_scale(self, points: NDArray[np.float64], frame: int, mm: float) -> str:
+        """Bring the folder to mm by two points (2, 3) of a frame that are so far apart; what was done, in a line.
+
+        The viewer goes on in the units that it has read.
+
+        Raises:
+            InputError: no length, or the folder cannot be written.
+        """
+        old = self.sequence.scale
+        scale = scale_between(points, self.cameras[frame], mm, frame, old, "Known length, mm")
+        write_scale(self.sequence.path, scale)
+        ratio = scale.factor / (old.factor if old else 1.0)
+        shown = f"1 {length_unit(self.relative)} shown here is {ratio:.4g} mm"
+        return f"Saved: {scale.text}. {shown}; open the folder again to see mm."
 
     def _dots(self, settings: ViewSettings, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         cloud = self.cloud(settings)

@@ -36,7 +36,6 @@ from .tube import shape_by_light
 BYTES_PER_PX = 60  # memory in which a thread compares two frames, bytes for each px
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
 NEGLIGIBLE_DEGREES = 1e-3
-PATH_RECORD = "camera_path.json"  # in a sequence folder: how each pose was found, and how sure it is
 ASSUMED, CALIBRATED = "assumed field of view", "calibration"  # origins of the focal length: `sources.lens`
 How = Literal["best", "own", "colmap"]
 METHODS: dict[str, How] = {"auto": "best", "auto-own": "own", "estimate": "best", "own": "own", "colmap": "colmap"}
