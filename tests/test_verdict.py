@@ -126,6 +126,8 @@ def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
         ({"depth_triangulated_error": 0.05}, Facts(depth_is_guessed=True), "good", "5% off"),
         ({"depth_triangulated_error": 0.5}, Facts(), "doubtful", "50% off"),
         ({}, Facts(depth_is_guessed=True), "usable", "a guess from one eye"),
+        ({"depth_triangulated_error": 0.05}, Facts(depth_measured=0.27), "usable", "parallax on 27% of the tissue"),
+        ({"depth_triangulated_error": 0.05}, Facts(depth_measured=0.7), "good", "5% off"),
         ({}, Facts(share_used=0.7), "usable", "70% of the frames"),
         ({}, Facts(share_used=0.3), "doubtful", "30% of the frames"),
         ({}, Facts(share_with_missed_tools=0.08), "usable", "missed in 8%"),

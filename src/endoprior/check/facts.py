@@ -21,6 +21,7 @@ from ..data.description import PrepareRecord, read_description, read_record
 from ..data.files import in_order
 from ..data.found_tools import UNCERTAIN, read_rows
 from ..data.images import read_color
+from ..data.pixels import measured_share
 from ..data.scale import Scale
 from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
@@ -101,6 +102,7 @@ class DepthFacts:
     """Depth as read; in mm if the folder states the right unit. Statistics are of tissue, 0 without depth there."""
 
     coverage: NDArray[np.float64]  # (T,) share of tissue pixels with depth
+    measured: float | None  # share of the tissue where it was measured, and is no guess; None where that is not known
     median: NDArray[np.float64]  # (T,) NaN in a frame without any
     far: NDArray[np.float64]  # (T,) share of the tissue pixels with depth that are farther than `FAR_MM`
     low: float  # 1st percentile
@@ -308,8 +310,10 @@ def _depth(
     header = b""
     if png := min((sequence.path / "depth").glob("*.png"), default=None):
         header = png.read_bytes()[:26]
+    shares = [share for frame in samples if (share := measured_share(frame)) is not None]
     return DepthFacts(
         np.array(coverage),
+        float(np.mean(shares)) if shares else None,
         np.array(median),
         np.array(far),
         low,

@@ -46,6 +46,7 @@ def table(facts: Facts) -> list[tuple[str, str]]:
             "depth coverage",
             f"{depth.coverage.mean():.1%} of tissue ({depth.coverage.min():.1%} to {depth.coverage.max():.1%})",
         ),
+        *([] if depth.measured is None else [("depth measured", f"by parallax on {depth.measured:.0%} of the tissue")]),
         (
             "depth resolution",
             f"steps of {depth.step:.3g}, {f'{depth.bits} bits a value' if depth.bits else 'bits unknown'}",

@@ -16,6 +16,7 @@ FEWEST = 8  # ... and occurs in at least so many pixels, which measured depth at
 FARTHEST = 20.0  # depth beyond so many times the median of an image is an error of measurement
 CLIP_PERCENTILES = (3.0, 99.8)  # measured depths of a frame are clipped to these percentiles of themselves
 LEAST_PIXELS = 100  # the median of fewer says nothing
+SURE_DEPTH = 0.4  # confidence of a depth that counts as measured
 
 
 def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]:
@@ -67,6 +68,14 @@ def clean_depth(
     missing = near if cfg.lift_missing_depth else 0
     depth = np.where(valid, np.clip(raw, np.float32(near), np.float32(far)), np.float32(missing))
     return depth, np.ones_like(valid) if cfg.lift_missing_depth else valid
+
+
+def measured_share(frame: Frame) -> float | None:
+    """Share of the tissue of a frame whose depth was measured surely; None where depth has no confidence."""
+    if frame.depth_confidence is None:
+        return None
+    sure = np.count_nonzero(frame.tissue_mask & (frame.depth_confidence > SURE_DEPTH))
+    return sure / max(np.count_nonzero(frame.tissue_mask), 1)
 
 
 def shrunk_camera(camera: Camera, factor: int) -> Camera:

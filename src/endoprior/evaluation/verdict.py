@@ -22,6 +22,7 @@ WRONG_OVER_MEAN_DB = 2.0  # the mean of all frames by this, else nothing was lea
 FOLLOWED_DB = 3.0  # as the moved frame must, else not even flow follows this video
 LEAST_FRAMES = (0.8, 0.5)  # share of the frames that could be used
 SLIP_PX = (4.0, 10.0)
+MEASURED = 0.5  # share of the tissue from which parallax tells the depth of the whole
 DEPTH_ERROR = (0.15, 0.35)
 RELIEF = 0.1  # least correlation of the relief; sound phantoms have 0.2 to 0.5, flat and inverted depth less than 0
 CONTRADICTED = {
@@ -43,6 +44,8 @@ class Facts:
     share_with_missed_tools: float = 0.0
     depth_is_guessed: bool = False
     """Depth is guessed from one eye."""
+    depth_measured: float | None = None
+    """Share of the tissue whose depth the motion of the camera measured, 0..1; None where nothing was measured so."""
     motion_is_unknown: bool = False
     """The camera moves, or may move, and its path was not found."""
     findings: tuple[str, ...] = ()
@@ -115,7 +118,10 @@ def _depth(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, str
     if (relief := scores.get("depth_relief", 1.0)) < RELIEF:
         told = f"(correlation {relief:.2f})"
         yield DOUBTFUL, f"depth does not rise and fall as the moving camera triangulates it {told}"
-    if error is None and facts.depth_is_guessed:
+    share = facts.depth_measured
+    if share is not None and share < MEASURED:
+        yield USABLE, f"depth is measured by parallax on {share:.0%} of the tissue, and a guess beside it"
+    elif share is None and error is None and facts.depth_is_guessed:
         yield USABLE, "depth is a guess from one eye that nothing confirms: do not trust views from the side"
 
 

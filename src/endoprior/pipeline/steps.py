@@ -23,6 +23,7 @@ from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
 from ..data.description import MOTION, read_description
 from ..data.files import read_json
+from ..data.pixels import measured_share
 from ..evaluation.context import RenderedFrame, RenderedFrames, SceneFrames
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
@@ -192,7 +193,15 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
     is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
     codes = tuple(finding["code"] for finding in read_json(job.findings)["findings"])
-    facts = Facts(1 - len(left_out) / count, len(missed) / count, sequence.depth_is_guessed, is_unknown, codes)
+    shares = [share for frame in sequence.frames("test") if (share := measured_share(frame)) is not None]
+    facts = Facts(
+        share_used=1 - len(left_out) / count,
+        share_with_missed_tools=len(missed) / count,
+        depth_is_guessed=sequence.depth_is_guessed,
+        depth_measured=sum(shares) / len(shares) if shares else None,
+        motion_is_unknown=is_unknown,
+        findings=codes,
+    )
     result.verdict = verdict_on(result.scores, facts)
     result.save(job.run)
     title = [PREVIEW_TITLE] * job.is_preview + wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)

@@ -90,10 +90,10 @@ class PrepareConfig:
     """Resize wider images to this width, px; 0 keeps the size."""
 
     depth: str = "auto"
-    """`sgbm` (stereo), `shading` (monocular, relative), `depth-anything` (network, relative; the folder of its weights
-    may follow after a colon), a folder of depth files, `motion` (parallax of a moving camera, filled by shading, or by
-    what follows after a colon), or `none`. `auto` is `sgbm` for two cameras; for one `motion` where the camera moves
-    enough, else `shading`."""
+    """`sgbm` (stereo), `motion` (parallax of a moving camera), `shading` (one eye, relative), `depth-anything` (a
+    network), a folder of depth files, or `none`. `auto` is `sgbm` for two cameras; for one, `motion` where the camera
+    moves enough, else `shading`. A colon may follow: after `motion` what fills it where nothing is measured, without it
+    `shading`; after `depth-anything` the folder of its weights."""
     depth_unit_mm: float = 0.0
     """mm per unit of the files in a depth folder; required with such a folder unless its depth is relative."""
     depth_relative: Literal["no", "depth", "disparity"] = "no"

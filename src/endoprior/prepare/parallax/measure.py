@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...data.pixels import SURE_DEPTH
 from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
 from ..camera_path.tracks import PoseInput
@@ -22,7 +23,6 @@ from .partners import choose_partners
 from .sweep import Shot, Sweep
 from .views import View, Warp
 
-SURE = 0.4  # confidence of a pixel that counts as measured
 LEAST_SHARE = 0.1  # of the tissue that is measured, below which the path does not tell the depth
 LEAST_FRAMES = 0.5  # share of the frames that have partners, below which the camera moves too little
 BYTES_PER_PX = 400  # memory in which a thread measures a frame, bytes for each px of a fine view
@@ -97,7 +97,7 @@ def measure_depth(
             progress(i + 1)
         for i, found in zip(everything, pool.map(lambda i: clip.filled(i, measured, scores), everything), strict=True):
             filled[i], sureness[i] = found[0], np.round(255 * found[1])
-            shares[i] = (found[1] > SURE).sum() / max(clip.view(i).usable.sum(), 1)
+            shares[i] = (found[1] > SURE_DEPTH).sum() / max(clip.view(i).usable.sum(), 1)
         for i, found in zip(everything, pool.map(lambda i: clip.factor(i, filled), everything), strict=True):
             factor[i] = found
     share = float(shares[usable].mean()) if usable.any() else 0.0
