@@ -14,11 +14,12 @@ from endoprior.core.types import Camera, Frame
 from endoprior.initialization.sampling import GUESSED, pixel_probability
 from endoprior.model.presets import preset
 from endoprior.prepare.parallax.consistency import checked
+from endoprior.prepare.parallax.correlation import correlation
 from endoprior.prepare.parallax.filling import bent
 from endoprior.prepare.parallax.measure import measure_depth
 from endoprior.prepare.parallax.partners import LEAST_DEGREES, MOST_DEGREES, choose_partners, parallax
 from endoprior.prepare.parallax.semi_global import DIRECTIONS, aggregated
-from endoprior.prepare.parallax.sweep import correlation, peak, scaled_size
+from endoprior.prepare.parallax.sweep import peak, scaled_size
 from endoprior.prepare.parallax.views import View, Warp, matrix_at
 
 SIZE = (WIDTH, HEIGHT)
@@ -101,29 +102,57 @@ def test_the_matrix_of_a_smaller_image_sees_the_same_rays():
 # ---- what is alike
 
 
+def alike(view, *others, window_px=7):
+    """`correlation` with views that lie pixel on pixel."""
+    rows, columns = np.indices(view.detail.shape).astype(np.float32)
+    same = Warp(np.stack([columns, rows, np.ones_like(rows)]), np.zeros(3, np.float32))
+    return correlation(view, others, [same] * len(others), np.float32(1), window_px)
+
+
 def test_correlation_bears_changes_of_light_and_leaves_out_what_is_not_seen():
     rng = np.random.default_rng(0)
     detail = cv2.GaussianBlur(rng.normal(size=(40, 50)).astype(np.float32), (0, 0), 1.5)
     seen, other = np.ones_like(detail), rng.normal(size=detail.shape).astype(np.float32)
     inner = np.s_[5:-5, 5:-5]
-    assert correlation(View(detail, seen), 3 * detail + 0.2, seen, 7)[inner].min() > 0.97
-    assert correlation(View(detail, seen), -detail, seen, 7)[inner].max() < -0.9
-    assert abs(correlation(View(detail, seen), other, seen, 9)[inner].mean()) < 0.1
+    assert alike(View(detail, seen), View(3 * detail + 0.2, seen))[inner].min() > 0.97
+    assert alike(View(detail, seen), View(-detail, seen))[inner].max() < -0.9
+    assert abs(alike(View(detail, seen), View(other, seen), window_px=9)[inner].mean()) < 0.1
     hidden = seen.copy()
     hidden[:, 25:] = 0
-    found = correlation(View(detail, seen), detail, hidden, 7)
+    found = alike(View(detail, seen), View(detail, hidden))
     assert (found[5:-5, 30:] == -1).all() and found[5:-5, 5:20].min() > 0.97
 
 
 def test_correlation_is_that_of_a_slow_loop():
     rng = np.random.default_rng(1)
     (a, b), (u, v) = rng.normal(size=(2, 20, 24)).astype(np.float32), (rng.random((2, 20, 24)) > 0.2)
-    found = correlation(View(a * u, u.astype(np.float32)), b * v, v.astype(np.float32), 5)
-    for y, x in ((2, 2), (9, 13), (17, 21)):
-        window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
-        both = (u & v)[window]
-        if both.mean() > 0.6:
-            assert found[y, x] == pytest.approx(np.corrcoef(a[window][both], b[window][both])[0, 1], abs=1e-3)
+    found = alike(View(a * u, u.astype(np.float32)), View(b * v, v.astype(np.float32)), window_px=5)
+    for y in range(20):
+        for x in range(24):
+            window = np.s_[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+            both = (u & v)[window]
+            want = np.corrcoef(a[window][both], b[window][both])[0, 1] if both.sum() > 0.6 * 25 else -1
+            assert found[y, x] == pytest.approx(want, abs=1e-4)
+
+
+def test_of_the_partners_the_better_half_counts():
+    rng = np.random.default_rng(2)
+    detail, seen = rng.normal(size=(5, 12, 12)).astype(np.float32), np.ones((12, 12), np.float32)
+    views = [View(each, seen) for each in detail]
+    each = np.sort([alike(views[0], other) for other in views[1:]], 0)
+    assert np.allclose(alike(*views), each[2:].mean(0), atol=1e-6)
+    assert np.allclose(alike(*views[:4]), np.sort([alike(views[0], other) for other in views[1:4]], 0)[1:].mean(0))
+    assert np.allclose(alike(*views[:3]), np.maximum(*(alike(views[0], other) for other in views[1:3])))
+
+
+def test_correlation_looks_where_the_warp_points():
+    wide = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(30, 60)).astype(np.float32), (0, 0), 1.5)
+    here, there = (View(wide[:, k : k + 40].copy(), np.ones((30, 40), np.float32)) for k in (10, 5))
+    rows, columns = np.indices((30, 40)).astype(np.float32)
+    by_depth = Warp(np.stack([columns, rows, np.ones_like(rows)]), np.array([50, 0, 0], np.float32))  # 5 px at w = 0.1
+    found = correlation(here, [there], [by_depth], np.float32(0.1), 7)
+    assert found[4:-4, 4:30].min() > 0.97 and (found[:, 38:] == -1).all()
+    assert correlation(here, [there], [by_depth], np.float32(0.05), 7)[4:-4, 4:30].mean() < 0.6
 
 
 def test_a_view_has_no_shading_and_no_highlights():

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .correlation import correlation
 from .semi_global import aggregated
 from .views import View, Warp, matrix_at
 
@@ -25,8 +26,6 @@ STEP_COST, JUMP_COST = 0.1, 0.6  # of 1 - correlation
 FINER = (1 / 3, 1 / 9)  # steps of the finer searches, as shares of that between two planes
 AROUND = 3  # ... and their number on each side
 SMOOTH_PX = 1.5  # standard deviation by which the correlations of a finer search are smoothed
-NOISE = 2e-4  # variance of the detail that is noise
-COVERED = 0.6  # least share of a window that both frames show
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Sweep:
         step, score = float(self.planes[1] - self.planes[0]), np.zeros_like(found)
         for share in FINER:
             around = [
-                _correlation(shot.view, views, warps, found + np.float32(k * share * step), FINE_WINDOW_PX)
+                correlation(shot.view, views, warps, found + np.float32(k * share * step), FINE_WINDOW_PX)
                 for k in range(-AROUND, AROUND + 1)
             ]
             scores = np.stack([cv2.GaussianBlur(each, (0, 0), SMOOTH_PX) for each in around]).astype(np.float32)
@@ -77,49 +76,9 @@ class Sweep:
         here, views = shot.view.resized(size), [other.view.resized(size) for other in partners]
         costs = np.empty((size[1], size[0], len(self.planes)), np.float32)
         for d, inverse in enumerate(self.planes):
-            costs[..., d] = 1 - _correlation(here, views, warps, inverse, COARSE_WINDOW_PX)
+            costs[..., d] = 1 - correlation(here, views, warps, inverse, COARSE_WINDOW_PX)
         place, _ = peak(np.ascontiguousarray(-aggregated(costs, STEP_COST, JUMP_COST).transpose(2, 0, 1)))
         return np.interp(place, np.arange(len(self.planes)), self.planes).astype(np.float32)
-
-
-def _correlation(
-    view: View,
-    partners: Sequence[View],
-    warps: Sequence[Warp],
-    inverse: NDArray[np.float32] | np.float32,
-    window_px: int,
-) -> NDArray[np.float32]:
-    """(h, w) mean correlation with the better half of the partners at an inverse depth; -1 with what is not seen."""
-    scores = []
-    for other, warp in zip(partners, warps, strict=True):
-        x, y, _ = warp.at(inverse)
-        detail, usable = (cv2.remap(each, x, y, cv2.INTER_LINEAR) for each in (other.detail, other.usable))
-        scores.append(correlation(view, np.asarray(detail, np.float32), np.asarray(usable, np.float32), window_px))
-    kept = (len(scores) + 1) // 2
-    return np.sort(np.stack(scores), 0)[-kept:].mean(0)
-
-
-def correlation(
-    view: View, detail: NDArray[np.float32], usable: NDArray[np.float32], window_px: int
-) -> NDArray[np.float32]:
-    """(h, w) zero-mean normalized correlation of windows of two views, over what both show; -1 where that is little.
-
-    Args:
-        detail, usable: (h, w) of the other view, warped to the first one.
-    """
-
-    def mean(values: NDArray) -> NDArray:
-        return cv2.boxFilter(values, -1, (window_px, window_px), borderType=cv2.BORDER_CONSTANT)
-
-    weight = view.usable * usable
-    covered = mean(weight)
-    share = np.float32(1) / np.maximum(covered, np.float32(1e-3))
-    first, second = view.detail * weight, detail * weight
-    mean1, mean2 = mean(first) * share, mean(second) * share
-    variance1 = np.maximum(mean(first * view.detail) * share - mean1 * mean1, 0)
-    variance2 = np.maximum(mean(second * detail) * share - mean2 * mean2, 0)
-    product = mean(first * detail) * share - mean1 * mean2
-    return np.where(covered > COVERED, product / np.sqrt(variance1 * variance2 + np.float32(NOISE**2)), np.float32(-1))
 
 
 def peak(scores: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
