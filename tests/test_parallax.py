@@ -7,12 +7,20 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from conftest import write_tiny_sequence
 from relief import HEIGHT, MATRIX, WIDTH, path, pose, view
 
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
 from endoprior.core.geometry import back_project, project
 from endoprior.core.types import Camera, Frame
+from endoprior.data import load_sequence
+from endoprior.data.files import CONFIDENCE
+from endoprior.data.pixels import measured_share
 from endoprior.initialization.sampling import GUESSED, pixel_probability
 from endoprior.model.presets import preset
+from endoprior.prepare import PrepareConfig, prepare
+from endoprior.prepare.frames import WORK
 from endoprior.prepare.parallax.consistency import checked
 from endoprior.prepare.parallax.correlation import correlation
 from endoprior.prepare.parallax.filling import bent
@@ -21,6 +29,7 @@ from endoprior.prepare.parallax.partners import LEAST_DEGREES, MOST_DEGREES, cho
 from endoprior.prepare.parallax.semi_global import DIRECTIONS, aggregated
 from endoprior.prepare.parallax.sweep import peak, scaled_size
 from endoprior.prepare.parallax.views import View, Warp, matrix_at
+from endoprior.training.frames import TrainingFrames
 
 SIZE = (WIDTH, HEIGHT)
 CENTERED = MATRIX - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # the left-most pixel at 0
@@ -303,3 +312,57 @@ def test_first_gaussians_start_where_depth_was_measured():
     init = preset("default").init
     plain, weighted = (pixel_probability(each, init) for each in (replace(frame, depth_confidence=None), frame))
     assert np.allclose(weighted[:, 30:], plain[:, 30:]) and np.allclose(weighted[:, :30], GUESSED * plain[:, :30])
+
+
+# ---- in a folder
+
+
+def prepared(tmp_path, frames, **options):
+    """The notes and the folder of frames (H, W, 3) prepared as one eye."""
+    (tmp_path / "video").mkdir(exist_ok=True)
+    for i, rgb_u8 in enumerate(frames):
+        cv2.imwrite(str(tmp_path / f"video/{i:03d}.png"), rgb_u8[..., ::-1])
+    done = prepare(tmp_path / "video", tmp_path / "out", PrepareConfig(masks="none", **options))
+    return done.notes, done.out
+
+
+@pytest.mark.slow
+def test_prepare_measures_the_depth_of_a_moving_camera(tmp_path):
+    truth = [view(each) for each in path(16, speed=1.5)]
+    notes, out = prepared(tmp_path, [each.rgb_u8 for each in truth], poses="own", depth="motion")
+    assert any("parallax on" in note and "filled by shading" in note for note in notes)
+    sequence = load_sequence(out)
+    assert "parallax" in sequence.sources["depth"] and not (out / WORK).exists()
+    frame, true = sequence.frame(8), truth[8].depth
+    assert np.corrcoef(np.log(frame.depth).ravel(), np.log(true).ravel())[0, 1] > 0.8
+    assert frame.depth_confidence.mean() > 0.4 and measured_share(frame) > 0.5
+    literal = load_sequence(out, DataConfig(reliability="ignored"))
+    assert literal.frame(8).depth_confidence is None
+
+
+def test_motion_that_tells_nothing_is_an_error_and_leaves_nothing(tmp_path):
+    frames = [view(path(1)[0]).rgb_u8] * 5
+    with pytest.raises(InputError, match=r"expected a camera whose motion tells the depth, got .*--depth shading"):
+        prepared(tmp_path, frames, poses="still", depth="motion")
+    assert not (tmp_path / "out").exists()
+    _, out = prepared(tmp_path, frames, poses="still")
+    assert not (out / CONFIDENCE).exists() and load_sequence(out).sources["depth"] == "shading"
+
+
+def test_confidence_is_read_shrunk_and_weighs_the_depth(tmp_path):
+    write_tiny_sequence(tmp_path / "data")
+    names = sorted(file.name for file in (tmp_path / "data/images").iterdir())
+    height, width = cv2.imread(str(tmp_path / "data/images" / names[0])).shape[:2]
+    (tmp_path / "data" / CONFIDENCE).mkdir()
+    stored = np.zeros((height, width), np.uint8)
+    stored[:, ::2] = 255
+    for name in names:
+        cv2.imwrite(str(tmp_path / "data" / CONFIDENCE / name), stored)
+    sequence = load_sequence(tmp_path / "data")
+    assert (sequence.frame(0).depth_confidence == stored / 255).all()
+    assert (load_sequence(tmp_path / "data", DataConfig(shrink=2)).frame(0).depth_confidence == 0.5).all()
+    counted = TrainingFrames(sequence).frame(0).counted_depth.numpy()
+    assert set(np.unique(counted)) <= {0, np.float32(GUESSED), 1} and (counted == GUESSED).any()
+    (tmp_path / "data" / CONFIDENCE / names[0]).unlink()
+    with pytest.raises(InputError, match=CONFIDENCE):
+        load_sequence(tmp_path / "data").frame(0)

@@ -34,7 +34,7 @@ EPSILON = 1e-6  # keeps Eq. (6) finite where the mask or the prior is empty
 MIN_SQUARED_SPACING = 1e-7  # mm^2; initial scale of points that coincide, as EndoGaussian sets it
 ADAPTIVE_PERCENTILE = 97.0  # percentile of brightness that raises tau_v (released code)
 PRIOR_BYTES = 200  # memory per pixel while sampling the points of a frame, bytes
-GUESSED = 0.25  # how far a depth that is a guess is believed beside one that was measured
+GUESSED = 0.5  # how far a depth that is a guess is believed beside one that was measured
 MIN_POINTS = 4  # the initial scale needs three neighbors
 
 log = logging.getLogger(__name__)

@@ -104,7 +104,11 @@ class TrainingFrames:
         def build() -> Tensor:
             frame = self.sequence.frame(self.indices[position])
             rho = joint_texture_prior(frame.rgb, frame.tissue_mask, border=self._border)
-            return torch.from_numpy(rho if frame.weight is None else rho * frame.weight)
+            if frame.weight is not None:
+                rho = rho * frame.weight
+            if frame.depth_confidence is not None:  # a Gaussian at a guessed depth may not lie where it is seen
+                rho = rho * depth_weight(frame.depth_confidence)
+            return torch.from_numpy(rho)
 
         if self.device.type == "cpu":
             prior = self._priors.get(position, build)

@@ -23,7 +23,7 @@ from .partners import choose_partners
 from .sweep import Shot, Sweep
 from .views import View, Warp
 
-LEAST_SHARE = 0.1  # of the tissue that is measured, below which the path does not tell the depth
+LEAST_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
 LEAST_FRAMES = 0.5  # share of the frames that have partners, below which the camera moves too little
 BYTES_PER_PX = 400  # memory in which a thread measures a frame, bytes for each px of a fine view
 AROUND = 4  # frames on each side with which the depth of a frame is averaged
