@@ -150,6 +150,7 @@ def test_holes_cost_only_where_tissue_is_hidden():
         measured=measured,
         num_measured=100,
         counted=lambda mask: mask,
+        counted_depth=measured,
     )
     out = RenderOutput(color, alpha, depth, torch.zeros(0, 2), torch.zeros(0))
     assert "cover" not in supervised_terms(out, frame, LossConfig(cover_weight=0.0), NUMBA)
