@@ -63,10 +63,10 @@ def test_what_lies_behind_other_tissue_is_not_seen(scene: Scene) -> None:
 
 def test_the_gap_is_counted_to_the_nearest_frame_that_saw_it() -> None:
     seen = np.array([[True, False, False], [False, True, True], [False, False, False]])
-    support = WindowSupport(seen, np.array([0.0, 5.0, 10.0]))
+    support = WindowSupport(seen, np.array([0.0, 5.0, 10.0]), np.zeros(3, bool))
     np.testing.assert_allclose(support.gap(6.0), [6.0, 1.0, np.inf])
     np.testing.assert_array_equal(support.num_frames, [1, 2, 0])
-    assert np.isinf(WindowSupport(np.zeros((2, 0), bool), np.zeros(0)).gap(0.1)).all()
+    assert np.isinf(WindowSupport(np.zeros((2, 0), bool), np.zeros(0), np.zeros(2, bool)).gap(0.1)).all()
 
 
 def test_the_picture_counts_frames_and_hatches_what_none_saw(scene: Scene) -> None:
@@ -85,6 +85,19 @@ def test_the_picture_counts_frames_and_hatches_what_none_saw(scene: Scene) -> No
     changed = np.abs(shown.color - plain).max(-1) > 0.02
     assert 0.1 < changed[right].mean() < 0.7, "stripes"
     assert changed[left].mean() < 0.1
+
+
+def test_tissue_whose_depth_is_a_guess_is_dotted(scene: Scene) -> None:
+    camera, width = scene.cameras[0], scene.cameras[0].width
+    confidence = np.where(np.arange(width) < width // 2, 0.9, 0.1) * np.ones((camera.height, 1), np.float32)
+    plain = frames_of(scene, masks_of(camera, None, None, None))
+    sure = [replace(frame, depth_confidence=confidence.astype(np.float32)) for frame in plain]
+    before, after = (SupportMap(scene, lambda window, f=f: f).render(0.0, camera) for f in (plain, sure))
+    solid = np.isfinite(before.num_frames)
+    changed = np.abs(after.color - before.color).max(-1) > 0.02
+    assert not changed[:, : width // 2 - 8].any()
+    assert 0.03 < changed[:, width // 2 + 8 :][solid[:, width // 2 + 8 :]].mean() < 0.3, "dots"
+    np.testing.assert_array_equal(before.num_frames, after.num_frames)
 
 
 def test_tissue_from_another_time_is_tinted(scene: Scene) -> None:

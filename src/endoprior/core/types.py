@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+SURE_DEPTH = 0.4  # confidence of a depth that counts as measured, see `Frame.depth_confidence`
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera in OpenCV axes (x right, y down, z forward)."""

@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import DataConfig
-from ..core.types import Camera, Frame
+from ..core.types import SURE_DEPTH, Camera, Frame
 
 GAP = 1.5  # a number is a filling if it is larger than all others by this factor ...
 FEWEST = 8  # ... and occurs in at least so many pixels, which measured depth at such a distance does not
 FARTHEST = 20.0  # depth beyond so many times the median of an image is an error of measurement
 CLIP_PERCENTILES = (3.0, 99.8)  # measured depths of a frame are clipped to these percentiles of themselves
 LEAST_PIXELS = 100  # the median of fewer says nothing
-SURE_DEPTH = 0.4  # confidence of a depth that counts as measured
 
 
 def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]:

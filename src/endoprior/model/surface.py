@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry import bilinear, cells_at, expected_depth, project
-from ..core.types import Camera, Frame
+from ..core.types import SURE_DEPTH, Camera, Frame
 from .scene import Scene, Window
 from .single_scene import SingleScene
 
@@ -86,6 +86,8 @@ class WindowSupport:
     """(N, F)."""
     positions: NDArray[np.float64]
     """(F,) of these frames, counted from the start of the window."""
+    depth_is_guess: NDArray[np.bool_]
+    """(N,) whether the frames that show it do not measure its depth; False where they do not say."""
 
     @property
     def num_frames(self) -> NDArray[np.int64]:
@@ -120,6 +122,10 @@ class Support:
         """(N,) training frames that show each Gaussian; 0: a guess."""
         return np.concatenate([self._of(shown.window).num_frames for shown in self._scene.shown_at(time)])
 
+    def depth_is_guess(self, time: float) -> NDArray[np.bool_]:
+        """(N,) whether the frames that show each Gaussian do not measure its depth."""
+        return np.concatenate([self._of(shown.window).depth_is_guess for shown in self._scene.shown_at(time)])
+
     def gap(self, time: float) -> NDArray[np.float64]:
         """(N,) seconds from `time` to the nearest frame that shows each Gaussian; infinite for a guess."""
         shown = self._scene.shown_at(time)
@@ -129,11 +135,16 @@ class Support:
 
 def window_support(scene: SingleScene, frames: Iterable[Frame]) -> WindowSupport:
     """The support of one window in the `frames` that it was trained on."""
-    seen, positions = [], []
+    seen, positions = [np.zeros((len(scene), 0), bool)], []
+    confidence, told = np.zeros(len(scene)), np.zeros(len(scene))  # sums over the frames that show a Gaussian
     for frame in frames:
         means = scene.at(frame.time).means.cpu().numpy()
         surface = render_surface(scene, frame.time, frame.camera)
-        seen.append(project_visible(means, surface, frame.tissue_mask)[1])
+        pixels, shown = project_visible(means, surface, frame.tissue_mask)
+        seen.append(shown[:, None])
         positions.append(frame.time * len(scene.cameras))
-    none = np.zeros((len(scene), 0), bool)
-    return WindowSupport(np.stack(seen, 1) if seen else none, np.array(positions, np.float64))
+        if frame.depth_confidence is not None:
+            x, y = cells_at(pixels[shown], frame.camera.width, frame.camera.height)
+            confidence[shown] += frame.depth_confidence[y, x]
+            told[shown] += 1
+    return WindowSupport(np.hstack(seen), np.array(positions, np.float64), confidence < SURE_DEPTH * told)

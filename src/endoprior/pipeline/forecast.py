@@ -51,6 +51,7 @@ def parts_of(job: SequenceJob, waiting: Sequence[str]) -> list[Part]:
         evenly("prepare", "looking at tools and light", 0.6),
         evenly("prepare", "writing frames", 0.035 + 0.15 * mpx, frames),
         evenly("prepare", "following the camera", 0.03 + 0.15 * mpx, frames),
+        *([evenly("prepare", "depth by parallax", 0.12, frames)] if _may_measure_by_motion(job) else []),
         evenly("check", "measuring", 2.0 + (0.005 + 0.08 * mpx) * frames),
         evenly("train", "starting", 1.5 + 0.1 * frames),
         Part("train", "training", training_seconds(job.cfg, mpx), iterations(job.cfg)),
@@ -59,6 +60,14 @@ def parts_of(job: SequenceJob, waiting: Sequence[str]) -> list[Part]:
         evenly("player", "packing", 0.4 + 0.013 * frames),
     ]
     return [part for part in parts if part.step in waiting]
+
+
+def _may_measure_by_motion(job: SequenceJob) -> bool:
+    """Whether `prepare` measures depth by the motion of the camera if that moves: a video without a calibration mostly
+    has one eye."""
+    if not isinstance(job, Job):
+        return False
+    return job.prepare.demands_motion or (job.prepare.depth == "auto" and job.prepare.calibration is None)
 
 
 def iterations(cfg: Config) -> int:

@@ -96,7 +96,7 @@ def _side_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[
         side = "right" if degrees > 0 else "left"
         cells.append((f"frame {frame.index} from {abs(degrees)} degrees {side}", to_u8(out.color.cpu().numpy())))
     marked = SupportMap(scene, sequence.training_part).render(frame.time, frame.camera)
-    return [*cells, ("hatched: guessed; blue: from another time", to_u8(marked.color))]
+    return [*cells, (marked.legend, to_u8(marked.color))]
 
 
 def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:

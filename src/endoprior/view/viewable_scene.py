@@ -145,7 +145,7 @@ class ViewableScene:
         if settings.layer == "prior":
             return torch.cat([shown.window.scene.prior_score for shown in self.scene.shown_at(time)]).clamp(0, 1)
         if settings.layer == "support":
-            values = self._support.share(time)
+            values = np.where(self._support.depth_is_guess(time), 0, self._support.share(time))
         else:
             low, high = self._value_span(settings.layer, settings.since)
             values = self._measured(settings.layer, settings.since, settings.frame)
@@ -244,7 +244,7 @@ class ViewableScene:
             "displacement": f"moved since frame {since}: blue 0 to red {high:.1f} {unit}",
             "stretch": f"largest stretch since frame {since}: {stretch}; black: not seen then",
             "prior": "texture-prior score of the Gaussians: blue 0 to red 1",
-            "support": "share of the frames that show this tissue: blue none, a guess, to red all",
+            "support": "share of the frames that show this tissue: blue none, or its depth is a guess, to red all",
             "difference": f"rendered minus input: blue 0 to red {LARGEST_DIFFERENCE:.0%}",
         }.get(settings.layer, "")
 

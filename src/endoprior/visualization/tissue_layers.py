@@ -33,6 +33,7 @@ FARTHEST = 2
 """Largest motion in the image that is carried, in widths of the image."""
 HATCHING, TINT = np.array((1.0, 1.0, 1.0)), np.array((0.2, 0.5, 1.0))
 """Colors of stripes, and of tissue from another time."""
+DOTS = np.array((0.0, 0.0, 0.0))  # color of dots where depth is a guess
 HATCHING_SHARE, TINT_SHARE = 0.6, 0.5
 """Their largest shares in a pixel."""
 TINTED_FROM_S, FULL_TINT_S = 0.1, 2.0
@@ -88,11 +89,14 @@ class SupportPicture(NamedTuple):
     """What one camera sees at one time, and where it is from."""
 
     color: NDArray[np.float32]
-    """(H, W, 3) in [0, 1]: the tissue, hatched where no frame saw it, and tinted where it is from another time."""
+    """(H, W, 3) in [0, 1]: the tissue, hatched where no frame saw it, tinted where it is from another time, and dotted
+    where it was seen, but its depth not measured."""
     num_frames: NDArray[np.float32]
     """(H, W) training frames that saw this tissue; NaN where there is none."""
     gap_seconds: NDArray[np.float32]
     """(H, W) time to the nearest of them; infinite where no frame saw it, NaN where there is no tissue."""
+    legend: str
+    """What the marks mean, in one short line."""
 
 
 class SupportMap:
@@ -108,26 +112,36 @@ class SupportMap:
         frames, gap = self._support.num_frames(time), self._support.gap(time)
         guessed, most, longest = ~np.isfinite(gap), max(frames.max(initial=0), 1), self._longest
         numbers = np.column_stack([frames / most, np.where(guessed, 0, gap / longest), guessed])
-        color, blended, alpha = _rendered(self._scene, self._scene.at(time), camera, numbers)
+        splats = self._scene.at(time)
+        color, blended, alpha = _rendered(self._scene, splats, camera, numbers)
         solid = alpha > SOLID_ALPHA
         share, gap, guess = np.moveaxis(blended / np.where(solid, alpha, 1)[..., None], -1, 0)
         seconds = gap / np.maximum(1 - guess, 1e-6) * longest
         is_guess = guess > 0.5
+        dotted = np.zeros_like(solid)
+        if (by_depth := self._support.depth_is_guess(time)).any():
+            shares = _rendered(self._scene, splats, camera, np.repeat(by_depth[:, None], 3, 1))[1][..., 0]
+            dotted = solid & ~is_guess & (shares > 0.5 * alpha)
         return SupportPicture(
-            _marked(color, solid & is_guess, np.where(solid & ~is_guess, seconds, 0)),
+            _marked(color, solid & is_guess, np.where(solid & ~is_guess, seconds, 0), dotted),
             np.where(solid, np.where(is_guess, 0, share * most), np.nan).astype(np.float32),
             np.where(solid, np.where(is_guess, np.inf, seconds), np.nan).astype(np.float32),
+            f"hatched: guessed; {'dotted: depth guessed' if dotted.any() else 'blue: from another time'}",
         )
 
 
-def _marked(color: NDArray, guessed: NDArray[np.bool_], seconds: NDArray) -> NDArray[np.float32]:
-    """(H, W, 3) `color` with hatching where (H, W) `guessed`, and a tint by `seconds` (H, W)."""
+def _marked(
+    color: NDArray, guessed: NDArray[np.bool_], seconds: NDArray, dotted: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """(H, W, 3) `color` with hatching where `guessed`, a tint by `seconds`, and dots where `dotted`, (H, W) each."""
     height, width = guessed.shape
     tint = TINT_SHARE * np.clip((seconds - TINTED_FROM_S) / (FULL_TINT_S - TINTED_FROM_S), 0, 1)[..., None]
     color = (1 - tint) * color + tint * TINT
     stripe = (pixel_centers(width, height).sum(-1) * STRIPES / width) % 2 < 0.7
     hatching = HATCHING_SHARE * (guessed & stripe)[..., None]
-    return ((1 - hatching) * color + hatching * HATCHING).astype(np.float32)
+    dots = HATCHING_SHARE * (dotted & ((pixel_centers(width, height) * STRIPES / width) % 2 < 0.7).all(-1))[..., None]
+    color = (1 - hatching) * color + hatching * HATCHING
+    return ((1 - dots) * color + dots * DOTS).astype(np.float32)
 
 
 def write_texture_film(
@@ -157,6 +171,6 @@ def write_support_film(
             shown = support.render(*view)
             with whole_file(out / f"{file_stem(k, frames)}.npy") as temporary:
                 np.save(temporary, np.stack([shown.num_frames, shown.gap_seconds], -1))
-            yield [label(to_u8(shown.color), "hatched: guessed; blue: from another time")]
+            yield [label(to_u8(shown.color), shown.legend)]
 
     write_film(pictures(), out, video, frames_per_second, frames)

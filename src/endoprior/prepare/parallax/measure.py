@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data.pixels import SURE_DEPTH
+from ...core.types import SURE_DEPTH
 from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
 from ..camera_path.tracks import PoseInput
