@@ -24,9 +24,9 @@ class Render(Command):
     With `--layer texture` it writes texture/*.png and texture.mp4: a grid painted on the first frame, carried by the
     model's motion, beside the input. Where the grid slides on the tissue, the motion is wrong (docs/results.md).
 
-    With `--layer support` it writes support/*.png and support.mp4: tissue that no frame saw is hatched, tissue whose
-    depth is a guess is dotted, tissue from another time is blue; support/*.npy says how many frames saw it and how many
-    seconds away the nearest is.
+    With `--layer support` it writes support/*.png and support.mp4: tissue that no frame saw is hatched, guessed depth
+    is dotted, tissue from another time blue; support/*.npy says how many frames saw it and how many seconds away the
+    nearest is.
     """
 
     run: Path = field(metadata={"place": "RUN"})

@@ -146,6 +146,7 @@ class PrepareConfig:
             ("field_of_view_degrees", 10, 170), ("start", 0, 1e9), ("frames_per_second", 0, 1000),
             ("folder_rate", 0.01, 1000), ("max_frames", 2, 1_000_000), ("max_width", 0, 16384),
             ("depth_unit_mm", 0, 1e6), ("poses_unit_mm", 1e-6, 1e6), ("working_distance_mm", 1, 1000),
+            ("shaft_mm", 0, 1000),
         ):  # fmt: skip
             check_range(name, getattr(self, name), low, high)
         if not self.end > self.start:
