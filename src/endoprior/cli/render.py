@@ -25,8 +25,7 @@ class Render(Command):
     model's motion, beside the input. Where the grid slides on the tissue, the motion is wrong (docs/results.md).
 
     With `--layer support` it writes support/*.png and support.mp4: tissue that no frame saw is hatched, guessed depth
-    is dotted, tissue from another time blue; support/*.npy says how many frames saw it and how many seconds away the
-    nearest is.
+    is dotted, tissue from another time blue; support/*.npy has the number of frames, and seconds to the nearest.
     """
 
     run: Path = field(metadata={"place": "RUN"})
