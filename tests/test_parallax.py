@@ -293,6 +293,16 @@ def test_what_moves_by_itself_is_not_sure(tmp_path):
     assert sure[y - 10 : y + 10, x - 10 : x + 10].mean() < 0.15 < 0.4 < sure[:20].mean()
 
 
+def test_what_is_burned_into_the_image_is_not_infinitely_far(tmp_path):
+    camera_to_world = path(12, speed=1.5)
+    frames, logo = [view(each) for each in camera_to_world], view(path(40)[30]).rgb_u8[:40, :60]
+    for frame in frames:
+        frame.rgb_u8[40:80, 50:110] = logo
+    found = measured(tmp_path, frames, np.linalg.inv(camera_to_world))
+    assert found.sureness(6, SIZE)[48:72, 58:102].max() <= 1
+    assert np.median(errors(found, frames, 6)[48:72, 58:102]) < 0.1
+
+
 def test_a_camera_that_rests_tells_nothing(tmp_path):
     frames = [view(path(1)[0])] * 6
     found = measured(tmp_path, frames, np.tile(np.eye(4), (6, 1, 1)))

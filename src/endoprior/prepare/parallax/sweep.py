@@ -52,7 +52,10 @@ class Sweep:
         return cls(small, matrix_at(matrix, size, small), planes)
 
     def inverse_depth(self, shot: Shot, partners: Sequence[Shot]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(h, w) inverse depth of a frame, and the correlation with its partners, -1 to 1."""
+        """(h, w) inverse depth of a frame, and the correlation with its partners, -1 to 1.
+
+        At the ends of the planes it is 0: what is burned into the image does not move, as if it were infinitely far.
+        """
         coarse = scaled_size(self.size, COARSE_WIDTH)
         found = self._planes(shot, partners, coarse)
         found = cv2.resize(cv2.medianBlur(found, 5), self.size, interpolation=cv2.INTER_LINEAR)
@@ -67,6 +70,7 @@ class Sweep:
             scores = np.stack([cv2.GaussianBlur(each, (0, 0), SMOOTH_PX) for each in around]).astype(np.float32)
             place, score = peak(scores)
             found = cv2.medianBlur(found + np.float32(share * step) * (place - AROUND), 5)
+        score[(found <= self.planes[1]) | (found >= self.planes[-2])] = 0
         return np.clip(found, self.planes[0], self.planes[-1]).astype(np.float32), score.astype(np.float32)
 
     def _planes(self, shot: Shot, partners: Sequence[Shot], size: tuple[int, int]) -> NDArray[np.float32]:
