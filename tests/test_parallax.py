@@ -359,6 +359,18 @@ def test_motion_that_tells_nothing_is_an_error_and_leaves_nothing(tmp_path):
     assert not (out / CONFIDENCE).exists() and load_sequence(out).sources["depth"] == "shading"
 
 
+@pytest.mark.parametrize("filler", ["none", "auto", "sgbm"])
+def test_what_fills_measured_depth_must_be_relative(tmp_path, filler):
+    frames = [view(path(1)[0]).rgb_u8] * 3
+    if filler == "auto":  # of one eye: shading, but nothing moves
+        with pytest.raises(InputError, match="motion tells the depth"):
+            prepared(tmp_path, frames, poses="still", depth="motion:auto")
+    else:
+        with pytest.raises(InputError, match="expected relative depth after"):
+            prepared(tmp_path, frames, poses="still", depth=f"motion:{filler}")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["video"]
+
+
 def test_confidence_is_read_shrunk_and_weighs_the_depth(tmp_path):
     write_tiny_sequence(tmp_path / "data")
     names = sorted(file.name for file in (tmp_path / "data/images").iterdir())

@@ -74,6 +74,9 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
     notes = _check_stereo(samples, clip) if clip.stereo else []
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
+    if cfg.demands_motion and not relative:
+        want = "relative depth after `motion:`, such as motion:shading"
+        raise input_error("--depth", want, cfg.depth, "Use `--depth motion`.")
     measure, source, depth_notes = _measured_depth(kind, cfg, first_pass)
     tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples)
     notes += depth_notes + mask_notes
