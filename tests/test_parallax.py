@@ -345,7 +345,7 @@ def test_prepare_measures_the_depth_of_a_moving_camera(tmp_path):
     assert "parallax" in sequence.sources["depth"] and not (out / WORK).exists()
     frame, true = sequence.frame(8), truth[8].depth
     assert np.corrcoef(np.log(frame.depth).ravel(), np.log(true).ravel())[0, 1] > 0.8
-    assert frame.depth_confidence.mean() > 0.4 and measured_share(frame) > 0.5
+    assert frame.depth_confidence.mean() > 0.4 and measured_share([frame]) > 0.5
     literal = load_sequence(out, DataConfig(reliability="ignored"))
     assert literal.frame(8).depth_confidence is None
 

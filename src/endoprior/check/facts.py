@@ -310,10 +310,9 @@ def _depth(
     header = b""
     if png := min((sequence.path / "depth").glob("*.png"), default=None):
         header = png.read_bytes()[:26]
-    shares = [share for frame in samples if (share := measured_share(frame)) is not None]
     return DepthFacts(
         np.array(coverage),
-        float(np.mean(shares)) if shares else None,
+        measured_share(samples),
         np.array(median),
         np.array(far),
         low,

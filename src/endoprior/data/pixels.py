@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import cv2
@@ -69,12 +70,15 @@ def clean_depth(
     return depth, np.ones_like(valid) if cfg.lift_missing_depth else valid
 
 
-def measured_share(frame: Frame) -> float | None:
-    """Share of the tissue of a frame whose depth was measured surely; None where depth has no confidence."""
-    if frame.depth_confidence is None:
-        return None
-    sure = np.count_nonzero(frame.tissue_mask & (frame.depth_confidence > SURE_DEPTH))
-    return sure / max(np.count_nonzero(frame.tissue_mask), 1)
+def measured_share(frames: Iterable[Frame]) -> float | None:
+    """Mean share of the tissue of frames whose depth was measured surely; None where depth has no confidence."""
+    shares = [
+        np.count_nonzero(frame.tissue_mask & (frame.depth_confidence > SURE_DEPTH))
+        / max(np.count_nonzero(frame.tissue_mask), 1)
+        for frame in frames
+        if frame.depth_confidence is not None
+    ]
+    return sum(shares) / len(shares) if shares else None
 
 
 def shrunk_camera(camera: Camera, factor: int) -> Camera:

@@ -168,6 +168,11 @@ class SequenceMeta:
     sources: dict[str, str] = field(default_factory=dict)  # origin of each part; no paths, which may hold names
     note: str = ""  # for users of the sequence
 
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3) K, px; the left-most pixel is centered at 0.5."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
 
 class FrameFiles:
     """Writes the files of one frame after another into a folder, then what describes all of them."""
@@ -217,18 +222,17 @@ class FrameFiles:
             self._file(f"{folder}/{self.count:06d}.png").write_bytes(data)
         self.count += 1
 
-    def save(self, folder: str, index: int, pixels: NDArray) -> None:
-        """Write an image of frame `index` into `folder`, which is made."""
-        save_png(self._file(f"{folder}/{index:06d}.png"), pixels)
-
     def depth_units(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
         """(H, W) z in mm as a file stores it; 0 where it is missing or too far."""
         units = np.round(np.where(np.isfinite(depth) & (depth > 0), depth, 0) / self.meta.depth_scale)
         return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
-    def write_image(self, folder: str, pixels: NDArray) -> None:
-        """Write an image (`encode_png`) as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends."""
-        self._file(f"{folder}/{self.count:06d}.png").write_bytes(encode_png(pixels, COMPRESSION))
+    def write_image(self, folder: str, pixels: NDArray, index: int | None = None) -> None:
+        """Write an image (`encode_png`) of frame `index` as `folder`/NNNNNN.png; None: of the next frame that `add`
+        appends.
+        """
+        number = self.count if index is None else index
+        self._file(f"{folder}/{number:06d}.png").write_bytes(encode_png(pixels, COMPRESSION))
 
     def write_array(self, name: str, array: NDArray) -> None:
         """Write `name` (relative, `.npy`)."""

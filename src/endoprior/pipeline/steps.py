@@ -193,12 +193,11 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
     is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
     codes = tuple(finding["code"] for finding in read_json(job.findings)["findings"])
-    shares = [share for frame in sequence.frames("test") if (share := measured_share(frame)) is not None]
     facts = Facts(
         share_used=1 - len(left_out) / count,
         share_with_missed_tools=len(missed) / count,
         depth_is_guessed=sequence.depth_is_guessed,
-        depth_measured=sum(shares) / len(shares) if shares else None,
+        depth_measured=measured_share(sequence.frames("test")),
         motion_is_unknown=is_unknown,
         findings=codes,
     )

@@ -17,7 +17,7 @@ NETWORK, SAM2 = "depth-anything", "sam2"
 """Values of --depth and --masks that a folder of weights, or the name of a model, may follow after a colon."""
 MOTION, SHADING = "motion", "shading"
 """Values of --depth; the first may be followed by a colon and another one, which fills what motion does not measure."""
-METHODS = ("auto", MOTION, "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK, SAM2)
+METHODS = ("auto", MOTION, "none", "sgbm", SHADING, "still", "auto-own", "estimate", "own", "colmap", NETWORK, SAM2)
 """Values of --depth, --masks and --poses that are no paths."""
 Rectangle = tuple[int, int, int, int]  # x, y, width, height in px, in one camera's image of the source video
 

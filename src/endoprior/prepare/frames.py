@@ -45,7 +45,7 @@ FITTED_SAMPLES = 16  # number of frames to which the tool and shading models are
 MAX_ROW_OFFSET_PX = 1.5  # if the rows of the two cameras are further apart, stereo matching is poor
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
-WORK = "carried"  # folder of the segmenter's masks until the sequence is complete, for an interrupted run
+WORK = "carried"  # folder of the segmenter's masks, and of small depth maps, until the sequence is complete
 
 
 @dataclass(frozen=True)

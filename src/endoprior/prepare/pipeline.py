@@ -215,7 +215,6 @@ def _camera_path(
     """Poses of the written frames, None for a static camera; and notes for the user."""
     meta, turn, everything = files.meta, first_pass.geometry.turn, range(files.count)
     progress("following the camera", 0, files.count)
-    matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
     # Poses of a file are those of the source's left camera, which rectification turns.
     turn = None if np.array_equal(turn, np.eye(3)) else turn
     return sequence_path(
@@ -223,7 +222,7 @@ def _camera_path(
         files.pose_input,
         lambda: (map(files.color, everything), (~files.tools(i) for i in everything)),
         files.count,
-        Lens.centered_at_half(matrix, meta.width, meta.depth_relative, meta.baseline_mm),
+        Lens.centered_at_half(meta.matrix, meta.width, meta.depth_relative, meta.baseline_mm),
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
@@ -257,7 +256,7 @@ def _use_parallax(
             files.pose_input,
             np.linalg.inv(path.camera_to_world),
             path.explained,
-            np.array([[meta.fx, 0, meta.cx - 0.5], [0, meta.fy, meta.cy - 0.5], [0, 0, 1]]),
+            Lens.centered_at_half(meta.matrix, meta.width, meta.depth_relative).matrix,
             (meta.width, meta.height),
             files.folder / WORK,
             lambda done: progress("depth by parallax", done, files.count),
@@ -276,7 +275,7 @@ def _use_parallax(
     with frame_threads(BYTES_PER_PX * meta.width * meta.height) as pool:
         for index, units, sureness in pool.map(bend, range(files.count)):
             save_png(files.file("depth", index), units)
-            files.save(CONFIDENCE, index, sureness)
+            files.write_image(CONFIDENCE, sureness, index)
     source = f"parallax on {found.share:.0%} of the tissue, filled by {meta.depth_source}"
     files.meta = replace(meta, depth_source=source, sources=meta.sources | {"depth": source})
     return [f"depth is measured by the motion of the camera: {source}"]

@@ -37,8 +37,7 @@ def use_scale(
     if not (known_length or shaft_mm):
         return path, []
     meta = files.meta
-    matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
-    scale = find_scale(frame, files.count, matrix, known_length, shaft_mm)
+    scale = find_scale(frame, files.count, meta.matrix, known_length, shaft_mm)
     files.meta = replace(meta, depth_scale=meta.depth_scale * scale.factor, depth_relative=False, scale=scale)
     if path is not None:
         moved = path.camera_to_world.copy()
