@@ -20,7 +20,7 @@ from ..camera_path.tracks import PoseInput
 from .consistency import checked
 from .filling import bent, steady
 from .partners import choose_partners
-from .sweep import Shot, Sweep
+from .sweep import FINE_WIDTH, Shot, Sweep, scaled_size
 from .views import View, Warp
 
 LEAST_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
@@ -72,15 +72,11 @@ def measure_depth(
         frame: reads frame i, with a guess of its depth in the unit of the path.
         world_to_camera: (T, 4, 4). usable: (T,) whether a frame has a pose of its own.
         matrix: (3, 3) K, px; the left-most pixel is centered at 0. size: (width, height), px.
-        folder: for files of all frames, 15 bytes for each pixel of a small frame; made if it is not there.
+        folder: for files of all frames, 19 bytes for each pixel of a small frame; made if it is not there.
         progress: is told the number of frames measured.
     """
-    count = len(world_to_camera)
-    distance = np.array([_distance(frame(i)) for i in range(count)])
-    usable = usable & np.isfinite(distance)
-    partners = choose_partners(world_to_camera, matrix, size, np.where(usable, distance, 1.0), usable)
-    sweep = Sweep.of(matrix, size, float(np.median(distance[usable])) if usable.any() else 1.0)
-    clip, shares, shape = _Clip(frame, world_to_camera, usable, partners, sweep), np.zeros(count), sweep.size[::-1]
+    count, small = len(world_to_camera), scaled_size(size, FINE_WIDTH)
+    everything, shape = range(count), small[::-1]
     folder.mkdir(exist_ok=True)
 
     def stored(name: str, kind: type) -> NDArray:
@@ -89,15 +85,21 @@ def measure_depth(
 
     measured, scores = stored("inverse_depth", np.float32), stored("correlation", np.float16)
     sureness, filled, factor = stored("confidence", np.uint8), stored("depth", np.float32), stored("factor", np.float32)
-    everything = range(count)
+    guesses, distance, tissue_px, shares = stored("guess", np.float32), *np.zeros((3, count))
     with frame_threads(BYTES_PER_PX * shape[0] * shape[1]) as pool:
+        for i, found in zip(everything, pool.map(lambda i: _guessed(frame(i), small), everything), strict=True):
+            guesses[i], distance[i], tissue_px[i] = found
+        usable = usable & np.isfinite(distance)
+        partners = choose_partners(world_to_camera, matrix, size, np.where(usable, distance, 1.0), usable)
+        sweep = Sweep.of(matrix, size, float(np.median(distance[usable])) if usable.any() else 1.0)
+        clip = _Clip(frame, guesses, world_to_camera, usable, partners, sweep)
         for i, found in zip(everything, pool.map(clip.measured, everything), strict=True):
             if found is not None:
                 measured[i], scores[i] = found
             progress(i + 1)
         for i, found in zip(everything, pool.map(lambda i: clip.filled(i, measured, scores), everything), strict=True):
             filled[i], sureness[i] = found[0], np.round(255 * found[1])
-            shares[i] = (found[1] > SURE_DEPTH).sum() / max(clip.view(i).usable.sum(), 1)
+            shares[i] = (found[1] > SURE_DEPTH).sum() / max(tissue_px[i], 1.0)
         for i, found in zip(everything, pool.map(lambda i: clip.factor(i, filled), everything), strict=True):
             factor[i] = found
     share = float(shares[usable].mean()) if usable.any() else 0.0
@@ -108,10 +110,11 @@ class _Clip:
     """The frames of a clip, one at a time."""
 
     def __init__(
-        self, frame: Callable[[int], PoseInput], poses: NDArray, usable: NDArray, partners: list[tuple[int, ...]],
-        sweep: Sweep,
+        self, frame: Callable[[int], PoseInput], guesses: NDArray, poses: NDArray, usable: NDArray,
+        partners: list[tuple[int, ...]], sweep: Sweep,
     ) -> None:  # fmt: skip
-        self._frame, self._poses, self._usable, self._partners, self._sweep = frame, poses, usable, partners, sweep
+        self._frame, self._guesses, self._poses, self._usable = frame, guesses, poses, usable
+        self._partners, self._sweep = partners, sweep
         self._views: BoundedCache[View] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
 
     def view(self, i: int) -> View:
@@ -129,7 +132,7 @@ class _Clip:
 
     def filled(self, i: int, measured: NDArray, scores: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(h, w) depth of a frame, filled, and its confidence."""
-        guess, others = self._guess(i), [j for j in self._partners[i] if self._partners[j]]
+        guess, others = np.asarray(self._guesses[i]), [j for j in self._partners[i] if self._partners[j]]
         if not others:
             return guess, np.zeros_like(guess)
         inverse, confidence = checked(measured[i], scores[i], self._warps(i, others), [measured[j] for j in others])
@@ -140,19 +143,19 @@ class _Clip:
         """(h, w) factor of the guess, with the depth of the frames around averaged."""
         near = range(max(i - AROUND, 0), min(i + AROUND + 1, len(self._poses)))
         others = [j for j in near if j != i and self._usable[i] and self._usable[j]]
-        depth, guess = steady(filled[i], self._warps(i, others), [filled[j] for j in others]), self._guess(i)
+        depth, guess = steady(filled[i], self._warps(i, others), [filled[j] for j in others]), self._guesses[i]
         return np.divide(depth, guess, out=np.ones_like(depth), where=guess > 0)
 
     def _warps(self, i: int, others: Sequence[int]) -> list[Warp]:
         sweep = self._sweep
         return [Warp.between(sweep.matrix, self._poses[i], self._poses[j], sweep.size) for j in others]
 
-    def _guess(self, i: int) -> NDArray[np.float32]:
-        small = cv2.resize(self._frame(i).depth, self._sweep.size, interpolation=cv2.INTER_NEAREST)
-        return np.asarray(small, np.float32)
 
-
-def _distance(seen: PoseInput) -> float:
-    """Middle distance of the tissue of a frame; NaN where none has depth."""
+def _guessed(seen: PoseInput, size: tuple[int, int]) -> tuple[NDArray[np.float32], float, float]:
+    """Of a frame at `size` (w, h): its guessed depth (h, w), the middle of that on tissue, NaN where none has depth, and
+    the number of pixels of tissue.
+    """
     there = seen.tissue_mask & (seen.depth > 0)
-    return float(np.median(seen.depth[there])) if there.any() else np.nan
+    middle = float(np.median(seen.depth[there])) if there.any() else np.nan
+    guess = np.asarray(cv2.resize(seen.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+    return guess, middle, float(seen.tissue_mask.mean()) * size[0] * size[1]
