@@ -152,7 +152,7 @@ class _Clip:
 
 
 def _guessed(seen: PoseInput, size: tuple[int, int]) -> tuple[NDArray[np.float32], float, float]:
-    """Of a frame at `size` (w, h): its guessed depth (h, w), the middle of that on tissue, NaN where none has depth, and
+    """A frame at `size` (w, h): guessed depth (h, w), the middle of that on tissue, NaN where none has depth, and
     the number of pixels of tissue.
     """
     there = seen.tissue_mask & (seen.depth > 0)
