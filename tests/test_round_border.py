@@ -118,3 +118,18 @@ def test_an_uncertain_border_is_a_note_with_its_fix():
     sure, unsure = (border_notes(None, Circle(50, 40, 35, 2.0, agreement), [], 0.1) for agreement in (0.9, 0.5))
     assert len(sure) == 1 and "rim of 2 px" in sure[0]
     assert len(unsure) == 2 and "50% of it" in unsure[1] and "--border keep" in unsure[1]
+
+
+@pytest.mark.parametrize("axes", [(0.46, 0.47), (0.4, 0.47), (0.48, 0.3)])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_center_of_an_oval_is_not_that_of_the_circle_on_its_end(axes, seed):
+    """The lens is assumed to look through the center: 50 px beside it, every path and depth is wrong."""
+    seen = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
+    half = round(axes[0] * WIDTH), round(axes[1] * HEIGHT)
+    cv2.ellipse(seen, (WIDTH // 2, HEIGHT // 2), half, 0, 0, 360, 1, -1)
+    outline = find_outline([(image * seen).astype(np.uint8) for image in tissue(np.random.default_rng(seed))])
+    frame = make_geometry(
+        (WIDTH, HEIGHT), None, stereo=False, name="", field_of_view_degrees=70, max_width=0,
+        circle=outline.circle, outside=outline.outside,
+    )  # fmt: skip
+    assert np.allclose(frame.matrix[:2, 2] + frame.cut[:2], (WIDTH / 2, HEIGHT / 2), atol=2)

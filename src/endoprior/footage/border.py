@@ -31,6 +31,8 @@ FLAT = 3.0  # A part outside that cuts into the image is so many times longer al
 FADED, MOST_RIM = 0.8, 4  # The rim has less than this share of the level deeper inside; its largest width, in reaches
 CERTAIN = 0.9  # Below this sharp share of its outline, a border is uncertain
 MOVES = 0.002  # A border moves if it hides this share of the frame in half of the samples
+LEAST_EXPLAINED, NEAR = 0.6, 0.01  # Share of the outline that lies on its circle, as near as this share of the radius
+ONE_SIDED = 0.5  # Length of the mean of unit vectors from its center: an arc of 220 degrees; 0 for opposite arcs
 ANOTHER = 0.1  # Another image in the frame has at least this share of the area of the largest
 
 
@@ -195,15 +197,37 @@ class Outline:
 
 
 def find_outline(images: Sequence[Image]) -> Outline:
-    """Detect strips and a border of any shape in (H, W, 3) sample images."""
-    height, width = images[0].shape[:2]
+    """Detect strips and a border of any shape in (H, W, 3) sample images.
+
+    A circle that only an arc of the border lies on is none: the end of an oval, whose center is far from the circle's.
+    """
     circle = find_circle(images)
+    found = _outline(images, circle)
+    return found if circle is None or _explains(circle, found) else _outline(images, None)
+
+
+def _outline(images: Sequence[Image], circle: Circle | None) -> Outline:
+    """The outline within a circle, None for all of the image."""
+    height, width = images[0].shape[:2]
     strips = find_strips(images, circle)
     in_strip = np.ones((height, width), bool)
     in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
     inside = circle.mask(width, height, circle.margin_px) if circle else np.ones((height, width), bool)
     other = find_outside(images, inside & ~in_strip)
     return Outline(strips, circle, in_strip, other, ~inside | other.mask)
+
+
+def _explains(circle: Circle, outline: Outline) -> bool:
+    """Whether most of the outline lies on the circle, or opposite parts do; edges of frame and strips do not count."""
+    shown = ~(outline.outside | outline.in_strip)
+    y, x = np.nonzero(shown & grown(~shown, square(1)) & ~grown(outline.in_strip, square(1)))
+    if not len(x):
+        return True
+    toward = np.stack([x + 0.5 - circle.center_x, y + 0.5 - circle.center_y], 1)
+    distance = np.linalg.norm(toward, axis=1)
+    on = np.abs(distance - (circle.radius - circle.margin_px)) < max(NEAR * circle.radius, 2.0)
+    one_sided = np.linalg.norm((toward[on] / distance[on, None]).mean(0)) if on.any() else 1.0
+    return bool(on.mean() > LEAST_EXPLAINED or one_sided < ONE_SIDED)
 
 
 def masked_border(outline: Outline, images: Sequence[Image], tissue_masks: Iterable[Mask]) -> Mask:
