@@ -20,15 +20,15 @@ from endoprior.data.pixels import measured_share
 from endoprior.initialization.sampling import GUESSED, pixel_probability
 from endoprior.model.presets import preset
 from endoprior.prepare import PrepareConfig, prepare
+from endoprior.prepare.camera_path.even_view import EvenView, Warp, matrix_at
+from endoprior.prepare.camera_path.partners import LEAST_DEGREES, MOST_DEGREES, choose_partners, parallax
 from endoprior.prepare.frames import WORK
 from endoprior.prepare.parallax.consistency import checked
 from endoprior.prepare.parallax.correlation import correlation
 from endoprior.prepare.parallax.filling import bent
 from endoprior.prepare.parallax.measure import measure_depth
-from endoprior.prepare.parallax.partners import LEAST_DEGREES, MOST_DEGREES, choose_partners, parallax
 from endoprior.prepare.parallax.semi_global import DIRECTIONS, aggregated
 from endoprior.prepare.parallax.sweep import peak, scaled_size
-from endoprior.prepare.parallax.views import View, Warp, matrix_at
 from endoprior.training.frames import TrainingFrames
 
 SIZE = (WIDTH, HEIGHT)
@@ -123,19 +123,19 @@ def test_correlation_bears_changes_of_light_and_leaves_out_what_is_not_seen():
     detail = cv2.GaussianBlur(rng.normal(size=(40, 50)).astype(np.float32), (0, 0), 1.5)
     seen, other = np.ones_like(detail), rng.normal(size=detail.shape).astype(np.float32)
     inner = np.s_[5:-5, 5:-5]
-    assert alike(View(detail, seen), View(3 * detail + 0.2, seen))[inner].min() > 0.97
-    assert alike(View(detail, seen), View(-detail, seen))[inner].max() < -0.9
-    assert abs(alike(View(detail, seen), View(other, seen), window_px=9)[inner].mean()) < 0.1
+    assert alike(EvenView(detail, seen), EvenView(3 * detail + 0.2, seen))[inner].min() > 0.97
+    assert alike(EvenView(detail, seen), EvenView(-detail, seen))[inner].max() < -0.9
+    assert abs(alike(EvenView(detail, seen), EvenView(other, seen), window_px=9)[inner].mean()) < 0.1
     hidden = seen.copy()
     hidden[:, 25:] = 0
-    found = alike(View(detail, seen), View(detail, hidden))
+    found = alike(EvenView(detail, seen), EvenView(detail, hidden))
     assert (found[5:-5, 30:] == -1).all() and found[5:-5, 5:20].min() > 0.97
 
 
 def test_correlation_is_that_of_a_slow_loop():
     rng = np.random.default_rng(1)
     (a, b), (u, v) = rng.normal(size=(2, 20, 24)).astype(np.float32), (rng.random((2, 20, 24)) > 0.2)
-    found = alike(View(a * u, u.astype(np.float32)), View(b * v, v.astype(np.float32)), window_px=5)
+    found = alike(EvenView(a * u, u.astype(np.float32)), EvenView(b * v, v.astype(np.float32)), window_px=5)
     for y in range(20):
         for x in range(24):
             window = np.s_[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
@@ -147,7 +147,7 @@ def test_correlation_is_that_of_a_slow_loop():
 def test_of_the_partners_the_better_half_counts():
     rng = np.random.default_rng(2)
     detail, seen = rng.normal(size=(5, 12, 12)).astype(np.float32), np.ones((12, 12), np.float32)
-    views = [View(each, seen) for each in detail]
+    views = [EvenView(each, seen) for each in detail]
     each = np.sort([alike(views[0], other) for other in views[1:]], 0)
     assert np.allclose(alike(*views), each[2:].mean(0), atol=1e-6)
     assert np.allclose(alike(*views[:4]), np.sort([alike(views[0], other) for other in views[1:4]], 0)[1:].mean(0))
@@ -156,7 +156,7 @@ def test_of_the_partners_the_better_half_counts():
 
 def test_correlation_looks_where_the_warp_points():
     wide = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(30, 60)).astype(np.float32), (0, 0), 1.5)
-    here, there = (View(wide[:, k : k + 40].copy(), np.ones((30, 40), np.float32)) for k in (10, 5))
+    here, there = (EvenView(wide[:, k : k + 40].copy(), np.ones((30, 40), np.float32)) for k in (10, 5))
     rows, columns = np.indices((30, 40)).astype(np.float32)
     by_depth = Warp(np.stack([columns, rows, np.ones_like(rows)]), np.array([50, 0, 0], np.float32))  # 5 px at w = 0.1
     found = correlation(here, [there], [by_depth], np.float32(0.1), 7)
@@ -167,12 +167,14 @@ def test_correlation_looks_where_the_warp_points():
 def test_a_view_has_no_shading_and_no_highlights():
     seen = view(path(1)[0])
     lit = np.linspace(0.35, 1.0, WIDTH)[None, :, None]
-    plain, shaded = (View.of((seen.rgb_u8 * light).astype(np.uint8), seen.tissue_mask, SIZE) for light in (1.0, lit))
+    plain, shaded = (
+        EvenView.of((seen.rgb_u8 * light).astype(np.uint8), seen.tissue_mask, SIZE) for light in (1.0, lit)
+    )
     both = (plain.usable > 0) & (shaded.usable > 0)
     assert np.corrcoef(plain.detail[both], shaded.detail[both])[0, 1] > 0.95
     glossy = seen.rgb_u8.copy()
     glossy[40:50, 60:70] = 255
-    assert not View.of(glossy, seen.tissue_mask, SIZE).usable[40:50, 60:70].any()
+    assert not EvenView.of(glossy, seen.tissue_mask, SIZE).usable[40:50, 60:70].any()
 
 
 def test_a_peak_lies_between_planes():

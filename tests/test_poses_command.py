@@ -114,6 +114,16 @@ def test_given_poses_scale_relative_depth(relative, tmp_path):
     assert described(folder)["sources"]["poses"] == "file"
 
 
+def test_depth_that_the_old_path_measured_is_said(relative, tmp_path, capsys):
+    np.save(tmp_path / "true.npy", TRUE)
+    for measured in (False, True):
+        folder = shutil.copytree(relative, tmp_path / f"DATA{measured:d}")
+        if measured:
+            (folder / "depth_confidence").mkdir()
+        assert main(["poses", str(folder), "--poses", str(tmp_path / "true.npy")]) == 0
+        assert ("measured by parallax with the path before" in "".join(capsys.readouterr())) == measured
+
+
 @pytest.mark.parametrize(("source", "kept"), [("file", True), ("SLAM", True), ("COLMAP", False)])
 def test_only_estimated_poses_are_replaced_without_a_copy(folder, source, kept):
     facts = described(folder)

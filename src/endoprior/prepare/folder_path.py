@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..data.description import ESTIMATED_POSES, PATH_RECORD, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
-from ..data.files import list_files
+from ..data.files import CONFIDENCE, list_files
 from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
 from ..data.scale import described_scale, without_scale
@@ -24,6 +24,7 @@ from .camera_path.sequence_path import AS_OURS, ASSUMED, Reading, path_depth, se
 from .camera_path.tracks import MOTION, REFINED, CameraPath, Lens, PoseInput
 
 STATIC = "static camera"
+DEPTH_OF_OLD_PATH = "depth was measured by parallax with the path before; `endoprior prepare` measures it anew"
 SCALE_AGAIN = "To have mm, give it again: `endoprior scale DATA --known-length FRAME,X1,Y1,X2,Y2,MM`"
 
 
@@ -98,6 +99,8 @@ def write_folder_path(
     if relative and path is not None:
         shaped = enumerate(depths)
         replace_depth(folder, ((f.name, path_depth(path, i, decode_image(f, size), scale)) for i, f in shaped))
+    if (folder / CONFIDENCE).is_dir():
+        notes.append(DEPTH_OF_OLD_PATH)
     focal = fx * new.focal_factor
     bounds = np.array([depth_bounds(decode_image(file, size), scale) for file in depths])
     facts = {"width": width, "height": height, "fx": focal, "fy": fy * new.focal_factor, "cx": cx, "cy": cy}

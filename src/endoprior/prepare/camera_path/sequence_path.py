@@ -29,6 +29,7 @@ from .follow import Follower, follow_camera
 from .kind import path_motion
 from .own import own_path
 from .pose_file import is_model, read_model_poses, read_poses
+from .refine import refined_path
 from .shape import DepthShape, axial_cosine, fitted_shape
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
 from .tube import shape_by_light
@@ -49,6 +50,9 @@ camera is followed again so often with the better depth."""
 DRIVES = "forward", "backward", "translating"  # kinds of motion in which a tube is looked for
 LIT_FRAMES = 16  # number of frames that are asked for a tube
 UNKNOWN_POSES = "none: the motion of the camera is unknown"  # `sources.poses`
+STILL_EXPLAINED = 0.95  # share of the score of held-out tracks that a refined path keeps: tracks drift, it does not
+FIT = "path and lens are adjusted to direct matches of frames with parallax, which they fit"
+UNFIT = "direct matches of frames with parallax fit no camera"
 Frame = Callable[[int], PoseInput]
 
 
@@ -222,6 +226,8 @@ def find_path(
     own, follower = followed()
     if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.kind in DRIVES:
         own, follower = _deeper(own, follower, followed, frame, axial_cosine(lens.with_focal(own.focal_factor), size))
+    if lens.depth_is_relative and how != "colmap":
+        own = _refined(own, follower.tracks, frame, lens, size, refine_focal=refine_focal)
     if how == "own" or not is_installed():
         return own
     if how == "best" and (own.breathes or own.shape or count > LONGEST):  # COLMAP would give breathing to the camera
@@ -262,6 +268,29 @@ def _deeper(
     if not shape.pixels and new.explained.sum() < path.explained.sum():
         return path, follower
     return replace(new, shape=shape), tracks
+
+
+def _refined(
+    path: CameraPath, tracks: Tracks, frame: Frame, lens: Lens, size: tuple[int, int], *, refine_focal: bool
+) -> CameraPath:
+    """The path adjusted to direct matches if they fit and still explain the held-out tracks; else as it is."""
+
+    def deep(index: int) -> PoseInput:
+        seen = frame(index)
+        depth = seen.depth if path.shape is None else path.shape.shaped(index, seen.depth)
+        return replace(seen, depth=(depth * path.depth_scale[index]).astype(np.float32))
+
+    found = refined_path(path, deep, lens.with_focal(path.focal_factor), size, refine_focal=refine_focal)
+    if found is None:
+        return path
+    if not found.fits:
+        note = f"{UNFIT} (residual {found.residual_px:.1f} px of 640): the tissue moves by itself"
+        return replace(path, notes=[*path.notes, note])
+    if explained_share(tracks, lens, found.path) < STILL_EXPLAINED * explained_share(tracks, lens, path):
+        return path
+    motion = path_motion(found.path, tracks, lens.with_focal(found.path.focal_factor), size)
+    note = f"{FIT} (residual {found.residual_px:.2f} px of 640)"
+    return replace(found.path, motion=motion, notes=[*path.notes, note])
 
 
 def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:

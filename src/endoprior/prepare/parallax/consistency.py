@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .views import Warp
+from ..camera_path.even_view import Warp
 
 TOLERANCE = 0.02  # relative difference of two measured depths that halves their agreement
 MATCH_PX = 0.25  # standard deviation of a match, px of a fine view

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...compute.fastmath import REORDERED
-from .views import View, Warp
+from ..camera_path.even_view import EvenView, Warp
 
 NOISE = 2e-4  # variance of the detail that is noise
 COVERED = 0.6  # least share of a window that both frames show
@@ -22,8 +22,8 @@ _NEAR, _ONE = np.float32(1e-3), np.float32(1)
 
 
 def correlation(
-    view: View,
-    partners: Sequence[View],
+    view: EvenView,
+    partners: Sequence[EvenView],
     warps: Sequence[Warp],
     inverse: NDArray[np.float32] | np.float32,
     window_px: int,

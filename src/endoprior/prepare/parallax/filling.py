@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .views import Warp
+from ..camera_path.even_view import Warp
 
 REACHES = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48, 1 / 96)  # standard deviations, as shares of the width
 DOUBT = 0.05  # weight of no change beside that of pixels that are sure

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from ...core.types import SURE_DEPTH
 from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
+from ..camera_path.even_view import EvenView, Warp
+from ..camera_path.partners import choose_partners
 from ..camera_path.tracks import PoseInput
 from .consistency import checked
 from .filling import bent, steady
-from .partners import choose_partners
 from .sweep import FINE_WIDTH, Shot, Sweep, scaled_size
-from .views import View, Warp
 
 LEAST_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
 LEAST_FRAMES = 0.5  # share of the frames that have partners, below which the camera moves too little
@@ -115,12 +115,12 @@ class _Clip:
     ) -> None:  # fmt: skip
         self._frame, self._guesses, self._poses, self._usable = frame, guesses, poses, usable
         self._partners, self._sweep = partners, sweep
-        self._views: BoundedCache[View] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
+        self._views: BoundedCache[EvenView] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
 
-    def view(self, i: int) -> View:
-        def seen() -> View:
+    def view(self, i: int) -> EvenView:
+        def seen() -> EvenView:
             frame = self._frame(i)
-            return View.of(frame.rgb_u8, frame.tissue_mask, self._sweep.size)
+            return EvenView.of(frame.rgb_u8, frame.tissue_mask, self._sweep.size)
 
         return self._views.get(i, seen)
 

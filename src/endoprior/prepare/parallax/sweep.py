@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera_path.even_view import EvenView, Warp, matrix_at
 from .correlation import correlation
 from .semi_global import aggregated
-from .views import View, Warp, matrix_at
 
 COARSE_WIDTH, FINE_WIDTH = 128, 256  # px
 PLANES = 48
@@ -32,7 +32,7 @@ SMOOTH_PX = 1.5  # standard deviation by which the correlations of a finer searc
 class Shot:
     """A frame and where its camera is."""
 
-    view: View  # at the fine size
+    view: EvenView  # at the fine size
     pose: NDArray[np.float64]  # (4, 4) world to camera
 
 

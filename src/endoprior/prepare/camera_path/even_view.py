@@ -1,4 +1,4 @@
-"""A frame as depth from parallax sees it: small, without shading, without what is not tissue; and where it is.
+"""A frame in which places are compared: without shading, without what is not tissue; and where other cameras see it.
 
 The lamp moves with the camera, and brightness falls with distance: of two frames, not the brightness of a place is
 alike but its detail. Highlights move over the tissue, and do not count.
@@ -21,7 +21,7 @@ HIGHLIGHT = 0.5  # likelihood from which a pixel is a highlight
 
 
 @dataclass(frozen=True)
-class View:
+class EvenView:
     """A small frame (h, w)."""
 
     detail: NDArray[np.float32]
@@ -30,7 +30,7 @@ class View:
     """(h, w) 1 on tissue without highlights, else 0."""
 
     @classmethod
-    def of(cls, rgb_u8: NDArray[np.uint8], tissue_mask: NDArray[np.bool_], size: tuple[int, int]) -> View:
+    def of(cls, rgb_u8: NDArray[np.uint8], tissue_mask: NDArray[np.bool_], size: tuple[int, int]) -> EvenView:
         """The view of a frame (H, W, 3) with its tissue (H, W), at `size` (w, h)."""
         counts = tissue_mask & (specular_likelihood(rgb_u8 * np.float32(1 / 255)) < HIGHLIGHT)
         share = cv2.resize(counts.astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -42,11 +42,11 @@ class View:
         detail = usable * (log - cv2.GaussianBlur(log * usable, (0, 0), sigma) / weight)
         return cls(np.asarray(detail, np.float32), usable)
 
-    def resized(self, size: tuple[int, int]) -> View:
+    def resized(self, size: tuple[int, int]) -> EvenView:
         """The view at a smaller size (w, h)."""
         usable = cv2.resize(self.usable, size, interpolation=cv2.INTER_AREA)
         detail = cv2.resize(self.detail, size, interpolation=cv2.INTER_AREA)
-        return View(np.asarray(detail, np.float32), (usable > USABLE).astype(np.float32))
+        return EvenView(np.asarray(detail, np.float32), (usable > USABLE).astype(np.float32))
 
 
 @dataclass(frozen=True)
