@@ -81,6 +81,60 @@ def test_a_cut_is_a_cut_and_not_an_exposure_jump():
     assert found.cuts == (12,) and found.exposure_jumps == ()
 
 
+def view(tissue: np.ndarray, x: float, y: float = 0.0) -> np.ndarray:
+    """(HEIGHT, WIDTH, 3) uint8: what a camera that looks at (x, y), px, sees of tissue (2H, 2W, 3)."""
+    shift = np.array([[1, 0, -x], [0, 1, -y]], np.float32)
+    return cv2.warpAffine(tissue, shift, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT).astype(np.uint8)
+
+
+def smooth(seed: int) -> np.ndarray:
+    """(2H, 2W, 3) tissue of broad shades without corners, float levels."""
+    blurred = cv2.GaussianBlur(texture(seed), (0, 0), 12)
+    return np.clip(130 + 4 * (blurred - blurred.mean()), 20, 235)
+
+
+FAR = 0.4 * WIDTH
+JERKS = {
+    "returns": [FAR * (i in (11, 12, 13)) for i in range(COUNT)],
+    "stays": [FAR * (i > 11) for i in range(COUNT)],
+    "fast": [FAR / 2 * np.clip(i - 10, 0, 3) for i in range(COUNT)],
+}
+"""Where the camera looks in each image, px."""
+
+
+@pytest.mark.parametrize(
+    ("tissue", "jerk"), [(texture, each) for each in JERKS] + [(smooth, "returns"), (smooth, "fast")]
+)
+def test_a_jerk_of_the_camera_is_no_cut(tissue, jerk):
+    images = [view(tissue(0), x + 0.5 * i, 20) for i, x in enumerate(JERKS[jerk])]
+    assert find_changes(images).cuts == ()
+
+
+@pytest.mark.parametrize("tissue", [texture, smooth])
+@pytest.mark.parametrize("lasts", [1, 3])
+def test_a_fold_that_swings_in_is_no_cut(tissue, lasts):
+    fold, images = 0.8 * tissue(3)[:HEIGHT, :WIDTH], [view(tissue(0), 0.5 * i) for i in range(COUNT)]
+    for i, image in enumerate(images[12:], 1):
+        width = round(WIDTH / 2 * min(i / lasts, 1))
+        image[:, :width] = fold[:, :width]
+    assert find_changes(images).cuts == ()
+
+
+@pytest.mark.parametrize("tissue", [texture, smooth])
+def test_a_cut_is_found_also_behind_a_flash_or_a_short_shot(tissue):
+    images = [view(tissue(0 if i < 12 else 5), 0.5 * i) for i in range(COUNT)]
+    assert find_changes(images).cuts == (12,)
+    for other in (np.full_like(images[0], 250), view(tissue(7), 30)):
+        assert find_changes([*images[:5], other, *images[5:12]]).cuts == ()
+        for count in (1, 2, 3):
+            assert find_changes(images[:12] + [other] * count + images[12:]).cuts != ()
+
+
+def test_a_sweep_of_views_none_of_which_lasts_is_no_cut():
+    images = [view(smooth(max(i - 8, 0)), 30) for i in range(18)]  # from image 9 on another view each time
+    assert find_changes(images).cuts == ()
+
+
 def test_blur_and_other_colors_are_detected():
     images = clip()
     images[6] = cv2.GaussianBlur(images[6], (0, 0), 4)

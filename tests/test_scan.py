@@ -3,13 +3,14 @@
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
 from endoprior.cli import main
 from endoprior.data.images import read_color, save_png
 from endoprior.footage.changes import find_changes
-from endoprior.footage.scenes import breaks, jumps
+from endoprior.footage.scenes import breaks, half_stays, jumps, places_differ, standardized
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline.choice import choose_segment
 from endoprior.prepare.scan import scan_video
@@ -119,6 +120,17 @@ def test_a_cut_needs_a_jump_that_no_pair_of_images_bridges():
     fast = np.full(20, 0.4)
     assert not jumps(seconds, fast).any(), "a camera that moves fast all the time"
     assert np.flatnonzero(jumps(seconds, np.where(seconds == 1.0, 0.9, 0.05))).tolist() == [10]
+
+
+def test_a_view_that_comes_back_stays_in_half_or_never_lasts_is_no_other_place():
+    noise = np.random.default_rng(0).normal(size=(20, 51, 64)).astype(np.float32)
+    one, other, *rest = (standardized(cv2.GaussianBlur(each, (0, 0), 4) * 500) for each in noise)
+    assert places_differ([one] * 6, [other] * 6)
+    assert places_differ([one], [rest[0], *[other] * 5]), "a flash at the cut"
+    assert not places_differ([one] * 6, [other, other, *[one] * 4]), "a jerk that returns"
+    assert not places_differ([one] * 6, rest[:6]), "a sweep"
+    assert not places_differ([one] * 6, [np.hstack([other[:, :32], one[:, 32:]])] * 6), "a fold"
+    assert not half_stays(one, other) and half_stays(one, np.roll(one, 2, 1)), "a small shift"
 
 
 def test_the_command_writes_both_files_and_names_the_next_one(disturbed, tmp_path, capsys):

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from .components import Image, InOrder, Mask, runs
 from .disturbances import FrameQuality, disturbances, measure_quality, small_size
+from .scenes import REACH, View, change, jumps, places_differ, same_view, standardized
 from .scenes import THUMB_WIDTH as SCENE_WIDTH
-from .scenes import View, change, jumps, same_view, standardized
 
 THUMB_WIDTH = 160  # Images are compared at this width, px
 SAME_LEVELS = 0.03  # Images with a smaller mean difference, in levels of 255, are duplicates
@@ -88,7 +88,9 @@ def find_changes(images: Iterable[Image], each: InOrder = map) -> Changes:
     pairs, sharp = list(pairwise(thumbs)), np.array(sharpness)
     difference = np.array([np.abs(now - before).mean() for before, now in pairs], np.float64)
     seconds = np.arange(len(thumbs)) / USUAL_RATE
-    cuts = tuple(i for i in np.flatnonzero(jumps(seconds, _steps(thumbs))).tolist() if _is_cut(thumbs, i))
+    small = _small(thumbs)
+    steps = np.array([0.0, *(change(before, now) for before, now in pairwise(small))])
+    cuts = tuple(i for i in np.flatnonzero(jumps(seconds, steps)).tolist() if _is_cut(thumbs, small, i))
     scene = np.isin(np.arange(len(thumbs)), cuts).cumsum()
     off_color = np.abs(shares - np.median(shares, axis=0)).max(1) > COLOR_DISTANCE
     return Changes(
@@ -170,18 +172,22 @@ def _of_other_scenes(off_color: Mask, thumbs: Sequence[NDArray]) -> Mask:
     return found
 
 
-def _steps(thumbs: Sequence[NDArray]) -> NDArray[np.float64]:
-    """(T,) `change` of each image from the one before."""
+def _small(thumbs: Sequence[NDArray]) -> list[NDArray[np.float32]]:
+    """Thumbnails as `change` compares them."""
     size = SCENE_WIDTH, max(round(SCENE_WIDTH * thumbs[0].shape[0] / thumbs[0].shape[1]), 1)
-    small = [standardized(cv2.resize(thumb, size, interpolation=cv2.INTER_AREA)) for thumb in thumbs]
-    return np.array([0.0, *(change(before, now) for before, now in pairwise(small))])
+    return [standardized(cv2.resize(thumb, size, interpolation=cv2.INTER_AREA)) for thumb in thumbs]
 
 
-def _is_cut(thumbs: Sequence[NDArray], first: int) -> bool:
-    """Whether no tissue of before is found from image `first` on. Smoke, blur and a tool that moves are no cuts."""
+def _is_cut(thumbs: Sequence[NDArray], small: Sequence[NDArray[np.float32]], first: int) -> bool:
+    """Whether no tissue of before is found from image `first` on. Smoke, blur and a tool that moves are no cuts.
+
+    Args:
+        thumbs: (T,) of (h, w) gray levels. small: see `_small`.
+    """
+    if not places_differ(small[max(first - REACH, 0) : first], small[first : first + REACH]):
+        return False
     places = [[first - k for k in ACROSS if k <= first], [first - 1 + k for k in ACROSS if first - 1 + k < len(thumbs)]]
-    before, after = ([View(thumbs[i].astype(np.uint8)) for i in side] for side in places)
-    return not same_view(before, after)
+    return not same_view(*([View(thumbs[i].astype(np.uint8)) for i in side] for side in places))
 
 
 def is_combed(rgb_u8: Image) -> bool:

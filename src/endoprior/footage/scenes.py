@@ -1,13 +1,15 @@
 """Which images show the same tissue, by corners that are followed, else by features; and where a video is cut.
 
-At a cut the image changes at once, and no tissue of before is found again after it. Smoke, a tool that moves, blur and
-a flash change the image, too, but the tissue is the same before and after.
+At a cut the image changes at once, most images before it show one place and most after it another, and no tissue of
+before is found again. Smoke, a tool that moves, blur, a flash, a fold that swings in and a camera that jerks change the
+image, too, but the tissue is the same before and after.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from .alignment import align
 from .components import Image, Mask
 from .optical_flow import follow_both_ways
 
@@ -90,9 +93,13 @@ def _link(a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: floa
     return Link(float(shift) / width, float(np.median(away)) / width, float(inliers.sum() / of))
 
 
-def same_view(befores: Iterable[View], afters: Sequence[View]) -> bool:
-    """Whether some image before an event and some image after it show the same tissue."""
-    return any(feature_link(before, after) is not None for before in befores for after in afters)
+def same_view(befores: Sequence[View], afters: Sequence[View]) -> bool:
+    """Whether images before and after an event, the nearest first, show the same tissue.
+
+    By the features of any two, or if the nearest ones can be aligned: smooth tissue has no features.
+    """
+    found = any(feature_link(before, after) is not None for before in befores for after in afters)
+    return found or align(befores[0].gray, afters[0].gray) is not None
 
 
 THUMB_WIDTH = 64  # images that follow each other are compared at this width, px
@@ -100,6 +107,10 @@ LEAST_SPREAD = 8.0  # standard deviation of gray levels below which an image sho
 JUMP, JUMP_RATIO = 0.25, 3.0
 """Least change of the image at a cut, in standard deviations, and relative to the usual change around it."""
 ALIKE = 0.88  # largest correlation with the image before, shifted as fits best; what moves a little has more
+REACH = 6  # so many images before and after what looks like a cut are compared
+HALF_ALIKE = 0.97  # least correlation of a half that stays; the border of round images alone reaches 0.955
+HALF_SHIFT = 8  # a half may move by this part of its shorter side
+HALF_SPREAD = 0.3  # least standard deviation of a half that shows something, of that of the whole thumbnail
 AROUND_S = 0.5  # what is around it, s
 
 
@@ -119,6 +130,41 @@ def change(before: NDArray[np.float32], now: NDArray[np.float32]) -> float:
     if min(middle.std(), now.std()) < 0.1:  # black or white: any two are alike
         return found
     return 0.0 if cv2.matchTemplate(now, middle, cv2.TM_CCOEFF_NORMED).max() > ALIKE else found
+
+
+def places_differ(before: Sequence[NDArray[np.float32]], after: Sequence[NDArray[np.float32]]) -> bool:
+    """Whether thumbnails before an event show one place, and those after it another.
+
+    No if the view comes back, as after a jerk of the camera or a flash; if no view lasts, as while the camera is swept;
+    or if half of the image stays, as where a fold swings in.
+
+    Args:
+        before, after: up to `REACH` thumbnails each, see `standardized`, in the order of time.
+    """
+    images, split = [*before, *after], len(before)
+    pairs = combinations(range(len(images)), 2)
+    alike = [(i, j) for i, j in pairs if change(images[i], images[j]) <= JUMP]
+    place = connected(len(images), alike)
+    first, second = place[:split], place[split:]
+    lasting = all(2 * np.bincount(side).max() >= len(side) for side in (first, second))
+    return lasting and not np.isin(first, second).any() and not half_stays(before[-1], after[0])
+
+
+def half_stays(before: NDArray[np.float32], now: NDArray[np.float32]) -> bool:
+    """Whether the left, right, upper or lower half of a thumbnail, see `standardized`, is in the next one.
+
+    What swings in from a side leaves the other half as it was.
+    """
+    rows, columns = (side // 2 for side in now.shape)
+    for part in np.s_[:, :columns], np.s_[:, -columns:], np.s_[:rows], np.s_[-rows:]:
+        half, there = before[part], np.ascontiguousarray(now[part])
+        margin = max(min(half.shape) // HALF_SHIFT, 1)
+        inner = np.ascontiguousarray(half[margin:-margin, margin:-margin])
+        if not inner.size or min(inner.std(), there.std()) < HALF_SPREAD:
+            continue
+        if cv2.matchTemplate(there, inner, cv2.TM_CCOEFF_NORMED).max() > HALF_ALIKE:
+            return True
+    return False
 
 
 def jumps(seconds: NDArray[np.float64], changes: NDArray[np.float64]) -> NDArray[np.bool_]:

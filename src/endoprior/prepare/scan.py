@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from ..footage.components import Image, runs
 from ..footage.disturbances import FrameQuality, disturbances, measure_quality, scenes_outside, small_size, view_mask
 from ..footage.scenes import (
+    JUMP,
+    REACH,
     THUMB_WIDTH,
     Link,
     View,
@@ -23,6 +25,7 @@ from ..footage.scenes import (
     feature_link,
     flow_link,
     jumps,
+    places_differ,
     standardized,
 )
 from .source import open_source, quick_images
@@ -82,13 +85,17 @@ def scan_video(
     rate = float(np.clip(LOOKS / max(source.seconds, 1e-3), *RATES))
     watch, looks, frozen = _Watch(inside, rate), list[Look](), list[float]()
     times, changes, positions = list[float](), list[float](), list[int]()  # of every image; looks before each
-    thumb = before = None
+    thumbs, refuted, before = deque[NDArray[np.float32]](maxlen=2 * REACH), set[int](), None
     for seconds, image in quick_images(source):
         now = standardized(image(THUMB_WIDTH, max(round(THUMB_WIDTH * size[1] / size[0]), 1), is_gray=True))
         times.append(seconds)
-        changes.append(0.0 if thumb is None else change(thumb, now))
+        changes.append(change(thumbs[-1], now) if thumbs else 0.0)
         positions.append(len(looks))
-        thumb = now
+        thumbs.append(now)
+        if len(changes) >= REACH and changes[-REACH] > JUMP:
+            around = list(thumbs)
+            if not places_differ(around[:-REACH], around[-REACH:]):
+                refuted.add(len(changes) - REACH)
         if looks and seconds < looks[-1].seconds + 1 / rate - 1e-6:
             continue
         small = image(*size)
@@ -99,7 +106,7 @@ def scan_video(
         progress(seconds, source.seconds)
     sudden = np.zeros(len(looks) + 1, bool)
     first_after = np.full(len(looks) + 1, np.inf)
-    for i in np.flatnonzero(jumps(np.array(times), np.array(changes))):
+    for i in set(np.flatnonzero(jumps(np.array(times), np.array(changes))).tolist()) - refuted:
         sudden[positions[i]] = True
         first_after[positions[i]] = min(first_after[positions[i]], times[i])
     is_cut = breaks(len(looks), watch.pairs) & sudden[: len(looks)]
