@@ -1,4 +1,4 @@
-"""What is recorded of found tools: rows of a folder, also of one that was interrupted, and `prepare` writes them."""
+"""What is recorded of found tools: rows of a folder, and `prepare` writes them, also if it was interrupted."""
 
 import json
 
@@ -9,8 +9,10 @@ import pytest
 from endoprior import tool_masks
 from endoprior.core.checks import InputError
 from endoprior.data import found_tools
-from endoprior.data.found_tools import FoundTools, FrameRow, RowLog
-from endoprior.prepare import PrepareConfig, frames, prepare
+from endoprior.data.found_tools import FoundTools, FrameRow
+from endoprior.prepare import PrepareConfig, prepare
+from endoprior.prepare.frame_tools import FOUND
+from endoprior.tool_masks.network import small_view
 
 ROWS = [FrameRow(i, 0.1, confidence) for i, confidence in enumerate((0.9, 0.2, 0.8, 0.4))]
 NUM_FRAMES = 6
@@ -33,22 +35,6 @@ def test_a_damaged_file_is_one_line(tmp_path, text):
     assert "\n" not in str(error.value)
 
 
-def test_the_rows_of_an_interrupted_run_end_at_the_first_incomplete_one(tmp_path):
-    log = RowLog(tmp_path)
-    for row in ROWS:
-        log.add(row)
-    lines = tmp_path / "tool_masks.jsonl"
-    lines.write_text(lines.read_text()[:-9])
-    again = RowLog(tmp_path)
-    assert again.rows == ROWS[:3]
-    again.cut(2)
-    again.add(ROWS[2])
-    assert RowLog(tmp_path).rows == ROWS[:3]
-    again.finish()
-    again.remove()
-    assert found_tools.read_rows(tmp_path) == ROWS[:3] and not lines.exists()
-
-
 @pytest.fixture
 def images(tmp_path):
     """A folder of frames, each with its number as the brightness of a corner."""
@@ -65,18 +51,19 @@ def images(tmp_path):
 
 @pytest.fixture
 def finder(monkeypatch):
-    """Takes the place of our own: unsure in bright frames. Holds the number of its calls."""
-    calls = []
+    """Takes the place of our own: unsure in bright frames. Holds the frames that it was asked for."""
+    asked = []
 
     class Finder:
-        def find(self, rgb_u8, view):
-            calls.append(1)
-            mask = np.zeros_like(view)
-            mask[:8, :32] = True
-            return FoundTools(mask, 1 - float(rgb_u8[4:12, 4:12].mean()) / 255)
+        def find_over_time(self, images, view, each):
+            small = np.zeros(small_view(view).shape, bool)
+            small[:12, :48] = True
+            for rgb_u8 in images:
+                asked.append(rgb_u8)
+                yield FoundTools(small, 1 - float(rgb_u8[4:12, 4:12].mean()) / 255)
 
     monkeypatch.setattr(tool_masks, "ToolFinder", Finder)
-    return calls
+    return asked
 
 
 CFG = PrepareConfig(layout="mono", border="keep", depth="none", poses="still")
@@ -94,10 +81,8 @@ def test_prepare_writes_the_confidence_of_each_frame_and_names_the_unsure(tmp_pa
     assert len(finder) == NUM_FRAMES  # each once, though they are the samples of the first pass, too
 
 
-def test_a_resumed_prepare_has_the_same_rows(tmp_path, images, finder, monkeypatch):
-    monkeypatch.setattr(frames, "FITTED_SAMPLES", 2)
+def test_a_resumed_prepare_has_the_same_rows_and_does_not_search_again(tmp_path, images, finder):
     want = (prepare(images, tmp_path / "want", CFG).out / "tool_masks.json").read_bytes()
-    usual = len(finder)
 
     def stop(what, done, total):
         if what == "writing frames" and done == 4:
@@ -106,8 +91,9 @@ def test_a_resumed_prepare_has_the_same_rows(tmp_path, images, finder, monkeypat
     with pytest.raises(KeyboardInterrupt):
         prepare(images, tmp_path / "out", CFG, stop)
     finder.clear()
-    assert (prepare(images, tmp_path / "out", CFG).out / "tool_masks.json").read_bytes() == want
-    assert len(finder) == usual - 2  # two of the three frames that are complete, the other one is a sample
+    done = prepare(images, tmp_path / "out", CFG).out
+    assert (done / "tool_masks.json").read_bytes() == want and not finder
+    assert not (done / FOUND).exists()
 
 
 def test_masks_that_are_not_found_have_no_confidence(tmp_path, images, finder):

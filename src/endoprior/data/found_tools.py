@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -100,42 +99,3 @@ def mark_moving(folder: Path, frames: Iterable[int]) -> None:
 def uncertain_frames(rows: Iterable[FrameRow]) -> list[int]:
     """The frames whose masks should be looked at."""
     return [row.frame for row in rows if row.confidence < UNCERTAIN]
-
-
-class RowLog:
-    """Rows of a folder that is being written, one line each, so that an interrupted run need not find them again."""
-
-    def __init__(self, folder: Path) -> None:
-        self._file = folder / f"{FILE}l"
-        self.rows: list[FrameRow] = []
-        lines = self._file.read_text(encoding="utf-8", errors="replace").splitlines() if self._file.is_file() else []
-        for line in lines:  # of the interrupted run, up to the first that is not complete
-            try:
-                row = FrameRow(**json.loads(line))
-            except (ValueError, TypeError):
-                break
-            if row.frame != len(self.rows):
-                break
-            self.rows.append(row)
-
-    def cut(self, count: int) -> None:
-        """Keep the rows of the first `count` frames: the others, and a line cut short, will be written again."""
-        self.rows = self.rows[:count]
-        self._write("w", self.rows)
-
-    def add(self, row: FrameRow) -> None:
-        """Append a row; it is on the disk before the files of its frame are."""
-        self.rows.append(row)
-        self._write("a", [row])
-
-    def _write(self, mode: str, rows: list[FrameRow]) -> None:
-        with self._file.open(mode, encoding="utf-8", newline="\n") as lines:
-            lines.writelines(json.dumps(row.stored()) + "\n" for row in rows)
-
-    def finish(self) -> None:
-        """Write `FILE`."""
-        write_rows(self._file.parent, self.rows)
-
-    def remove(self) -> None:
-        """Remove the lines; the folder is complete without them."""
-        self._file.unlink(missing_ok=True)

@@ -48,8 +48,8 @@ def parts_of(job: SequenceJob, waiting: Sequence[str]) -> list[Part]:
     parts = [
         evenly(COMPILE, "kernels, once", COMPILE_S / kernel_cache.USUAL_COUNT, kernel_cache.USUAL_COUNT),
         evenly("prepare", "looking through", 1.0 + 0.015 * frames),
-        evenly("prepare", "looking at tools and light", 0.6),
-        evenly("prepare", "writing frames", 0.035 + 0.15 * mpx, frames),
+        evenly("prepare", "looking for tools", 0.04, frames),
+        evenly("prepare", "writing frames", 0.01 + 0.15 * mpx, frames),
         evenly("prepare", "following the camera", 0.03 + 0.15 * mpx, frames),
         *([evenly("prepare", "depth by parallax", 0.12, frames)] if _may_measure_by_motion(job) else []),
         evenly("check", "measuring", 2.0 + (0.005 + 0.08 * mpx) * frames),

@@ -1,29 +1,29 @@
-"""The tools of frames: found by the network, or read from the user's files; and which frames have a mask.
-
-A network that is asked for sample frames first is not asked for them again.
-"""
+"""The tools of frames: found by the network in the whole clip, or read from the user's files; which have a mask."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.description import TOOLS_FOUND
 from ..data.found_tools import FoundTools
 from ..data.frame_files import match_names
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import open_mask_folder
+from ..data.writer import found_source
+from ..system.atomic import whole_file
 from ..system.parallel import frame_threads
 from .config import PrepareConfig, is_sam2
-from .first_pass import FirstPass, Mask, MeasuredFrame
+from .first_pass import FirstPass, Image, Mask, MeasuredFrame
 
 BYTES_PER_PIXEL = 200  # of the source: memory that a thread needs to measure a frame, bytes
 COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete
 HINT = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
-Tools = Callable[[MeasuredFrame], FoundTools]  # the tools of a frame; those that the user gives have confidence 1
+Tools = Callable[[int], FoundTools]  # the tools of a frame, by its place in the source; the user's have confidence 1
+FOUND = "found_tools.npz"  # file of the work folder
 
 
 def names_folder(masks: str) -> bool:
@@ -55,27 +55,50 @@ def masked_frames(cfg: PrepareConfig, first_pass: FirstPass) -> tuple[frozenset[
 
 
 def choose_tools(
-    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
-) -> tuple[Tools, str, list[str]]:
-    """A function that returns the tools of a frame, the name of its source, and notes."""
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame], every: Iterable[Image], folder: Path,
+) -> tuple[Tools, str, list[str]]:  # fmt: skip
+    """A function that returns the tools of a frame, the name of its source, and notes.
+
+    Args:
+        every: (H, W, 3) all frames of `first_pass.indices`, read only if tools are searched in them.
+        folder: keeps what was found, so that an interrupted run need not search again.
+    """
     inside = first_pass.geometry.inside
     if names_folder(cfg.masks):
         return _given_tools(cfg, first_pass, samples)
     if cfg.mask_labels:
         raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
     if cfg.masks == "none":
-        return lambda _frame: FoundTools(np.zeros_like(inside), 1.0), "none", []
-    from ..tool_masks import ToolFinder  # imports torch
+        return lambda _index: FoundTools(np.zeros_like(inside), 1.0), "none", []
+    masks, confidences = _searched(every, inside, folder / FOUND)
+    places = {index: place for place, index in enumerate(first_pass.indices)}
 
-    finder = ToolFinder()
-    with frame_threads(BYTES_PER_PIXEL * inside.size) as pool:
-        found = list(pool.map(lambda sample: finder.find(sample.rgb_u8, inside), samples))
-    known = {sample.index: each for sample, each in zip(samples, found, strict=True)}
-    share = np.mean([each.mask.any() for each in found])
-    source = f"{TOOLS_FOUND} in {share:.0%} of the samples" if share else f"no {TOOLS_FOUND}"
+    def tools(index: int) -> FoundTools:
+        from ..tool_masks.network import full_size  # imports torch
+
+        place = places[index]
+        return FoundTools(full_size(masks[place], inside.shape) & inside, float(confidences[place]))
+
+    share = float(masks.any((1, 2)).mean())
+    source = found_source(share)
     hint = HINT if share else "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
     notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
-    return lambda frame: known.get(frame.index) or finder.find(frame.rgb_u8, inside), source, notes
+    return tools, source, notes
+
+
+def _searched(every: Iterable[Image], inside: Mask, file: Path) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """(T, h, w) the tools of all frames at the network's size, and (T,) the confidence of each."""
+    from ..tool_masks import ToolFinder  # imports torch
+    from ..tool_masks.network import small_view
+
+    if not file.is_file():
+        with frame_threads(BYTES_PER_PIXEL * inside.size) as pool:
+            found = list(ToolFinder().find_over_time(every, inside, pool.map))
+        with whole_file(file) as temporary, temporary.open("wb") as out:
+            packed = np.packbits([each.mask for each in found], axis=-1)
+            np.savez(out, masks=packed, confidences=[each.confidence for each in found])
+    with np.load(file) as stored:
+        return np.unpackbits(stored["masks"], axis=-1, count=small_view(inside).shape[1]) > 0, stored["confidences"]
 
 
 def _given_tools(
@@ -87,13 +110,13 @@ def _given_tools(
     names = [each.name for each in given.frames]
     matched = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
 
-    def high(frame: MeasuredFrame) -> Mask:
-        return first_pass.frame_of(given.frames[matched.files[frame.index]].read)
+    def high(index: int) -> Mask:
+        return first_pass.frame_of(given.frames[matched.files[index]].read)
 
     notes = [f"masks: {each}" for each in (given.note, matched.rule) if each]
     tool_is_high = given.tool_is_high
     if tool_is_high is None or cfg.mask_tool_value != "auto":
-        polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
+        polarity = tool_polarity(cfg.mask_tool_value, [high(f.index) for f in samples], [f.rgb_u8 for f in samples])
         tool_is_high = polarity.tool_is_high
         notes.append(f"masks: {polarity.reason}")
-    return lambda frame: FoundTools(high(frame) == tool_is_high, 1.0), "user's files", notes
+    return lambda index: FoundTools(high(index) == tool_is_high, 1.0), "user's files", notes

@@ -19,7 +19,7 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.ranges import spread
 from ..data import load_sequence
-from ..data.found_tools import FoundTools, FrameRow, write_rows
+from ..data.found_tools import FrameRow, write_rows
 from ..data.frame_files import match_files
 from ..data.images import DEPTH_SUFFIXES, read_color, read_depth_file, read_stored, read_values, save_png
 from ..data.pixels import is_measured
@@ -63,9 +63,13 @@ class FrameMethods:
     notes: list[str]  # notes for the user, one line each
 
 
-def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> FrameMethods:
-    """Choose the methods and fit their models to samples of the clip.
+def choose_methods(
+    cfg: PrepareConfig, clip: Clip, first_pass: FirstPass, folder: Path, progress: Progress
+) -> FrameMethods:
+    """Choose the methods, fit their models to samples of the clip, and find the tools of all frames.
 
+    Args:
+        folder: keeps what was found, for a run that resumes.
     Raises:
         InputError: a folder named by an option cannot be used, or an option needs a second camera.
     """
@@ -78,13 +82,14 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
         want = "relative depth after `motion:`, such as motion:shading"
         raise input_error("--depth", want, cfg.depth, "Use `--depth motion`.")
     measure, source, depth_notes = _measured_depth(kind, cfg, first_pass)
-    tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples)
+    every = _counted(all_frames(clip, first_pass), geometry, len(first_pass.indices), progress)
+    tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples, every, folder)
     notes += depth_notes + mask_notes
     shade = None
     if relative:
         images, usable = (
             [f.rgb_u8 for f in samples],
-            [geometry.inside & ~tools(f).mask & ~first_pass.hidden(f.rgb_u8) for f in samples],
+            [geometry.inside & ~tools(f.index).mask & ~first_pass.hidden(f.rgb_u8) for f in samples],
         )
         if measure is None:
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
@@ -100,6 +105,18 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
     wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
     return FrameMethods(measure, shade, tools, first_pass.hidden, kind == "sgbm", wanted, sources, relative, notes)
+
+
+def all_frames(clip: Clip, first_pass: FirstPass) -> Iterable[StereoFrame]:
+    """The selected frames: as they were kept in memory, else decoded once more."""
+    return first_pass.frames or clip.stereo_frames(clip.selection())
+
+
+def _counted(frames: Iterable[StereoFrame], geometry: FrameGeometry, count: int, progress: Progress) -> Iterator[Image]:
+    """The left images (H, W, 3) of frames, rectified."""
+    for done, frame in enumerate(frames, 1):
+        yield geometry.image(frame.left)
+        progress("looking for tools", done, count)
 
 
 def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
@@ -259,40 +276,36 @@ def write_frames(
     files: FrameFiles,
     *,
     keep_right: bool,
-    on_tools: Callable[[int, FoundTools], None],
     on_frame: Callable[[int], None],
 ) -> list[int]:
     """Write every wanted frame that `files` does not have yet.
 
     Args:
-        on_tools: called with the position of each frame and its tools before its files are written.
         on_frame: called after each frame with the number of frames written.
     Returns:
         Position in the source of each frame of the sequence.
     """
     done, used = files.count, []
 
-    def finished(window: list[MeasuredFrame]) -> tuple[int, FoundTools, dict[str, bytes]]:
-        """Position, tools and encoded files of the frame in the middle of a window."""
+    def finished(window: list[MeasuredFrame]) -> dict[str, bytes]:
+        """The encoded files of the frame in the middle of a window."""
         frame = window[len(window) // 2]
         depth = frame.depth
         if methods.filter_in_time:
             depth = temporal_median([other.depth for other in window if other.depth is not None])
-        found = methods.tools(frame)
-        tools = found.mask | ~geometry.inside | methods.hidden(frame.rgb_u8)
+        tools = methods.tools(frame.index).mask | ~geometry.inside | methods.hidden(frame.rgb_u8)
         if methods.shade:
             depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:
             depth = np.where(geometry.inside, depth, np.float32(0))
         rgb_u8 = np.where(geometry.inside[..., None], frame.rgb_u8, np.uint8(0))
-        return frame.position, found, files.encoded(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
+        return files.encoded(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
 
     with frame_threads(BYTES_PER_PIXEL * geometry.source_size[0] * geometry.source_size[1]) as pool:
         # After a resume, measure a few finished frames again: the temporal filter needs their depth.
         frames = measure_frames(stereo_frames, geometry, methods, max(done - REACH, 0), used, pool)
         windows = (each for each in with_neighbors(frames) if each[len(each) // 2].position >= done)
-        for position, found, encoded in pool.map(finished, windows):
-            on_tools(position, found)
+        for encoded in pool.map(finished, windows):
             files.append(encoded)
             on_frame(files.count)
     return used

@@ -18,7 +18,7 @@ from ..core.shell import changed_options, command
 from ..data import write_stir_tracks
 from ..data.description import PATH_RECORD, SIZE_NOT_STATED, PrepareRecord
 from ..data.files import CONFIDENCE
-from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncertain_frames
+from ..data.found_tools import FrameRow, mark_moving, read_rows, uncertain_frames, write_rows
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
@@ -32,8 +32,8 @@ from .camera_path.tracks import CameraPath, Lens, PoseInput
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
-from .frame_tools import masked_frames
-from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
+from .frame_tools import FOUND, masked_frames
+from .frames import WORK, FrameMethods, all_frames, choose_methods, replace_by_carried, write_frames
 from .parallax.measure import measure_depth
 from .scale.apply import demand_no_unit, use_scale
 from .scale.find import check_scale_options
@@ -107,8 +107,7 @@ def prepare(
     with work_folder(out, plan) as folder:
         clip, first_pass, step = _look(video, cfg, progress)
         inside = first_pass.geometry.inside
-        progress("looking at tools and light", 0, len(first_pass.indices))
-        methods = choose_methods(cfg, clip, first_pass)
+        methods = choose_methods(cfg, clip, first_pass, folder, progress)
         demand_no_unit(cfg.known_length, cfg.shaft_mm, methods.relative)
         files, used = _write(folder, cfg, clip, first_pass, methods, step, progress)
         first_pass.frames = None  # they are written now
@@ -133,7 +132,7 @@ def prepare(
         motion_notes += _use_parallax(video, cfg, files, path, progress)
         path, scale_notes = use_scale(files, files.pose_input, path, cfg.known_length, cfg.shaft_mm)
         shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
-        RowLog(folder).remove()
+        (folder / FOUND).unlink(missing_ok=True)
         files.finish(None if path is None else path.camera_to_world, unexplained, weights.tolist())
         video_notes = [*first_pass.video_notes, *_usage_notes(damaged, len(first_pass.indices) - len(used))]
         _record(video, cfg, first_pass.geometry, video_notes).save(folder)
@@ -173,22 +172,17 @@ def _write(
 ) -> tuple[_Written, list[int]]:  # fmt: skip
     """Write the frames that are not there yet; and the position in the source of every frame."""
     parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
-    found, done, finds_tools = RowLog(folder), frames_done(folder, parts), cfg.masks == "auto"
-    if finds_tools:
-        done = min(done, len(found.rows))
-        found.cut(done)
-    files = _Written(folder, _meta(clip, first_pass, methods, step), done)
+    files = _Written(folder, _meta(clip, first_pass, methods, step), frames_done(folder, parts))
     used = write_frames(
-        first_pass.frames or clip.stereo_frames(clip.selection()),
+        all_frames(clip, first_pass),
         first_pass.geometry,
         methods,
         files,
         keep_right=cfg.keep_right,
-        on_tools=lambda i, tools: found.add(FrameRow.of(i, tools)) if finds_tools else None,
         on_frame=lambda done: progress("writing frames", done, len(first_pass.indices)),
     )
-    if finds_tools and files.count >= 2:
-        found.finish()
+    if cfg.masks == "auto" and files.count >= 2:
+        write_rows(folder, (FrameRow.of(i, methods.tools(index)) for i, index in enumerate(used)))
     return files, used
 
 

@@ -17,8 +17,9 @@ from ..core.checks import input_error
 from ..core.ranges import spread
 from ..data import FrameSequence
 from ..footage.components import Mask, large_regions
-from .examples import Examples, clicked_region, examples_of, feature_map, fit, probability
+from .examples import Examples, clicked_region, examples_of, feature_map, fit
 from .network import ToolFinder, full_size, network_image, small_view
+from .over_time import MOST_LOG_ODDS
 from .regions import tool_regions
 from .sequence import SAMPLES, view_of
 
@@ -111,7 +112,8 @@ def _steps(
     for i in range(count):
         features, known = look(i)
         # Known tools count as certain, so that a part which touches one enters the view with it.
-        found = np.where(known, 1, probability(classifier.log_odds(features)) * small).astype(np.float32)
+        odds = np.clip(classifier.log_odds(features), -MOST_LOG_ODDS, MOST_LOG_ODDS)
+        found = np.where(known, MOST_LOG_ODDS, odds).astype(np.float32)
         parts = large_regions(tool_regions(found, small) & ~known, LEAST_PART_PX) | regions.get(i, False)
         yield SearchStep(len(taught) + i + 1, total, i, full_size(parts, view.shape) & view & ~tool(i))
 

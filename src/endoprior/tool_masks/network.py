@@ -9,6 +9,7 @@ the size of the whole image. The masks are a starting point: correct them in the
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -23,7 +24,8 @@ from torch.nn import functional
 
 from ..core.checks import check_shape, input_error
 from ..data.found_tools import FoundTools
-from ..footage.components import Image, Mask
+from ..footage.components import Image, InOrder, Mask
+from .over_time import Look, decide_over_time
 from .regions import tool_regions
 
 FILE = Path(__file__).with_name("tool_network.safetensors")
@@ -144,7 +146,7 @@ LEAST_DOUBT = 0.004  # Share of the view in doubt from which on a frame without 
 
 
 class ToolFinder:
-    """Finds the tools of single frames."""
+    """Finds the tools of single frames, and of clips."""
 
     def __init__(self, network: ToolNetwork | None = None) -> None:
         """Take a network in place of the one that comes with the program."""
@@ -167,13 +169,33 @@ class ToolFinder:
         """Find the tools of one frame; arguments as in `log_odds`."""
         if not view.any():
             return FoundTools(np.zeros_like(view), 1.0)
-        probability = 1 / (1 + np.exp(-self.log_odds(rgb_u8, view)))
+        log_odds, small = self.log_odds(rgb_u8, view), small_view(view)
+        mask = tool_regions(log_odds, small)
+        return FoundTools(full_size(mask, view.shape) & view, _confidence(mask, log_odds, small))
+
+    def find_over_time(self, images: Iterable[Image], view: Mask, each: InOrder = map) -> Iterator[FoundTools]:
+        """Find the tools of all frames of a clip, (h, w) at the network's size: see `full_size`.
+
+        Args:
+            images: (H, W, 3), in order. view: (H, W).
+            each: as `map`; threads can look at the images, in order.
+        """
         small = small_view(view)
-        mask = tool_regions(probability * small, small)
-        maybe = probability[(mask | (probability > MAYBE)) & small]
-        enough = mask.any() or maybe.size > LEAST_DOUBT * small.sum()
-        confidence = float(np.abs(2 * maybe - 1).mean()) if enough else 1.0
-        return FoundTools(full_size(mask, view.shape) & view, confidence)
+
+        def look(rgb_u8: Image) -> Look:
+            shrunk = cv2.resize(rgb_u8, small.shape[::-1], interpolation=cv2.INTER_AREA)
+            return Look(np.asarray(shrunk, np.uint8), self.log_odds(rgb_u8, view))
+
+        for tools in decide_over_time(each(look, images), small):
+            yield FoundTools(tools.mask, _confidence(tools.mask, tools.log_odds, small))
+
+
+def _confidence(mask: Mask, log_odds: NDArray[np.float32], view: Mask) -> float:
+    """That of `FoundTools`, from (h, w) arrays."""
+    probability = 1 / (1 + np.exp(-log_odds))
+    maybe = probability[(mask | (probability > MAYBE)) & view]
+    enough = mask.any() or maybe.size > LEAST_DOUBT * view.sum()
+    return float(np.abs(2 * maybe - 1).mean()) if enough else 1.0
 
 
 def network_size(shape: tuple[int, ...]) -> tuple[int, int]:

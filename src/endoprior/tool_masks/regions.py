@@ -1,6 +1,13 @@
-"""Regions of an image that can be tools: large enough, and sure or entering end first from the border of the view."""
+"""Regions of an image that can be tools: with an outline that the network is sure of, and sure or entering end first.
+
+A tool may touch what the network only half takes for one: a dark corner, smoke. The level of the log-odds at which a
+region ends is therefore its own: the lowest from which the next one hardly makes it smaller (a maximally stable
+extremal region, Matas et al. 2002). What shrinks with every level has no outline, and is no tool.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -8,9 +15,8 @@ from numpy.typing import NDArray
 
 from ..footage.components import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, components, disk, grown, regions_where
 
-SURE, POSSIBLE = 0.5, 0.35
-"""Thresholds of the tool probability: a pixel on its own, and a pixel next to such pixels (hysteresis)."""
-NEAR_PX = 4  # A possible pixel counts within this distance of a sure one
+LEVELS = np.arange(-0.6, 4.01, 0.5)  # of the log-odds, at which regions may end: probabilities from 0.35 to 0.98
+STABLE = 0.8  # Share of a region that the next level leaves of one with an outline
 SURE_REGION = 0.85
 """Mean probability from which on a region is a tool though it does not enter end first: gauze along the border, a
 needle, the head of an instrument whose shaft is hidden."""
@@ -19,18 +25,66 @@ REACH = 0.75
 At 0.5 an organ along the border passes; at 1 a thick shaft that has just entered fails."""
 LEAST_SHARE = 0.002  # Smaller regions, as a share of the view, are removed: about 25 px square at 640x512
 LARGEST_HOLE = 0.01  # Holes up to this share of the view are filled: highlights, and the windows of a grasper's jaws
+RIM_PX = 2  # Pixels this near to a tool belong to it from the first level on
+OUTSIDE = -8.0  # Log-odds beyond the view
 
 
-def tool_regions(probability: NDArray[np.floating], view: Mask) -> Mask:
-    """(h, w) True on the tools, from the probability (h, w), 0..1, of each pixel, and the view (h, w)."""
-    smooth = np.asarray(cv2.GaussianBlur(probability, (0, 0), 0.8))
-    sure = cv2.morphologyEx((smooth > SURE).astype(np.uint8), cv2.MORPH_OPEN, disk(1)) > 0
-    possible = (smooth > POSSIBLE) & grown(sure, disk(NEAR_PX))
-    mask = filled(sure | possible, LARGEST_HOLE * view.sum()) & view
-    labels, boxes = components(mask)
-    mean = np.bincount(labels.ravel(), smooth.ravel(), len(boxes)) / boxes[:, AREA].clip(1)
-    certain = (mean > SURE_REGION) & (boxes[:, AREA] >= LEAST_SHARE * view.sum())
-    return entering_regions(mask, view) | regions_where(certain, labels)
+@dataclass(frozen=True)
+class Region:
+    """A region with an outline of its own."""
+
+    mask: Mask  # (h, w)
+    is_tool: bool  # by this image alone
+
+
+def tool_regions(log_odds: NDArray[np.float32], view: Mask) -> Mask:
+    """(h, w) True on the tools, from the log-odds (h, w) of each pixel, and the view (h, w)."""
+    found = candidate_regions(log_odds, view)
+    return joined([region.mask for region in found if region.is_tool], log_odds, view)
+
+
+def candidate_regions(log_odds: NDArray[np.float32], view: Mask) -> list[Region]:
+    """All regions with an outline; arguments as in `tool_regions`. In one that is no tool, smaller ones may be."""
+    smooth, least, most = _smooth(log_odds, view), LEAST_SHARE * view.sum(), LARGEST_HOLE * view.sum()
+    probability = 1 / (1 + np.exp(-smooth))
+
+    def regions(mask: Mask, level: int) -> list[Region]:
+        """Those inside of the parts of a mask, which ends at this level."""
+        labels, boxes = components(mask)
+        return [
+            region
+            for i in range(1, len(boxes))
+            if boxes[i, AREA] >= least
+            for region in regions_of_part(labels == i, level)
+        ]
+
+    def regions_of_part(part: Mask, level: int) -> list[Region]:
+        is_last = level + 1 == len(LEVELS)
+        higher = np.zeros_like(part) if is_last else _opened(part & (smooth > LEVELS[level + 1]))
+        if not is_last and np.count_nonzero(higher) < STABLE * np.count_nonzero(part):
+            return regions(higher, level + 1)
+        whole = filled(part, most) & view
+        if probability[whole].mean() > SURE_REGION or entering_regions(whole, view).any():
+            return [Region(whole, True)]
+        inner = [region for region in regions(higher, level + 1) if region.is_tool]
+        return inner or [Region(whole, False)]
+
+    return regions(filled(_opened(smooth > LEVELS[0]), most) & view, 0)
+
+
+def joined(masks: list[Mask], log_odds: NDArray[np.float32], view: Mask) -> Mask:
+    """(h, w) the union of regions, with their rims."""
+    union = np.any([np.zeros_like(view), *masks], axis=0)
+    rim = (_smooth(log_odds, view) > LEVELS[0]) & grown(union, disk(RIM_PX))
+    return filled(union | rim, LARGEST_HOLE * view.sum()) & view
+
+
+def _smooth(log_odds: NDArray[np.float32], view: Mask) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(np.where(view, log_odds, np.float32(OUTSIDE)), (0, 0), 0.8), np.float32)
+
+
+def _opened(mask: Mask) -> Mask:
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disk(1)) > 0
 
 
 def entering_regions(mask: NDArray, view: Mask) -> Mask:

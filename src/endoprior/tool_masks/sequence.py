@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ..data import FrameSequence
 from ..data.found_tools import FoundTools
 from ..footage.border import find_outline, masked_border
 from ..footage.components import Mask, components, regions_where
-from .network import ToolFinder
+from .network import ToolFinder, full_size
 
 SAMPLES = 16  # Number of frames from which the border of the view is taken
 Progress = Callable[[str, int, int], None]
@@ -30,9 +31,9 @@ def find_in_sequence(
     """
     total, finder = len(sequence), ToolFinder()
     view = view_of([sequence.frame(i) for i in spread(total, SAMPLES)])
-    for i in range(total):
-        frame = sequence.frame(i)
-        found = finder.find(frame.rgb_u8, view)
+    images = (sequence.frame(i).rgb_u8 for i in range(total))
+    for i, small in enumerate(finder.find_over_time(images, view)):
+        frame, found = sequence.frame(i), replace(small, mask=full_size(small.mask, view.shape) & view)
         if refine:
             given = ~frame.tissue_mask & view
             labels, boxes = components(given | found.mask)
