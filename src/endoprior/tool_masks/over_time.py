@@ -27,6 +27,7 @@ COLOR_LEVELS, RETURN_PX = 15.0, 1.5
 COLOR_BLUR_PX = 1.0
 CHUNK, MARGIN = 120, 24  # Frames that are decided at once, and that are known beside them: KEEP^24 is 2 %
 AGREED = 0.5  # Share of the frames around that take a region for a tool
+LEAST_TRUST = 0.2  # Of that: a region that the network outlines in this frame too is hardly another thing
 Values = NDArray[np.float32]
 
 
@@ -64,7 +65,7 @@ def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
     odds = carried([np.clip(look.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS) for look in looks], links)
     regions = [candidate_regions(each, view) for each in odds]
     taken = [np.any([np.zeros_like(view), *(r.mask for r in found if r.is_tool)], axis=0) for found in regions]
-    agreed = carried([mask.astype(np.float32) for mask in taken], links)
+    agreed = carried([mask.astype(np.float32) for mask in taken], links, LEAST_TRUST)
     return [
         SmallTools(joined([r.mask for r in found if share[r.mask].mean() > AGREED], each, view), each)
         for found, share, each in zip(regions, agreed, odds, strict=True)
@@ -99,10 +100,14 @@ class Link:
         return cls(grid + back, grid + onward, behind, ahead)
 
 
-def carried(values: list[Values], links: list[Link]) -> list[Values]:
+def carried(values: list[Values], links: list[Link], least_trust: float = 0.0) -> list[Values]:
     """(h, w) weighted mean of each frame's values and those of the frames around, carried along the flow."""
-    ahead = _one_way(values, [(link.to_before, link.trust_after) for link in links])
-    behind = _one_way(values[::-1], [(link.to_after, link.trust_before) for link in links[::-1]])[::-1]
+
+    def step(places: NDArray[np.float32], trust: Values) -> tuple[NDArray[np.float32], Values]:
+        return places, least_trust + (1 - least_trust) * trust
+
+    ahead = _one_way(values, [step(link.to_before, link.trust_after) for link in links])
+    behind = _one_way(values[::-1], [step(link.to_after, link.trust_before) for link in links[::-1]])[::-1]
     # Both sums hold the frame itself.
     return [
         ((a[..., 0] + b[..., 0] - own) / (a[..., 1] + b[..., 1] - 1)).astype(np.float32)

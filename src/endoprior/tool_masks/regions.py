@@ -17,7 +17,7 @@ from ..footage.components import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, component
 
 LEVELS = np.arange(-0.6, 4.01, 0.5)  # of the log-odds, at which regions may end: probabilities from 0.35 to 0.98
 STABLE = 0.8  # Share of a region that the next level leaves of one with an outline
-SURE_REGION = 0.85
+SURE_REGION = 0.8
 """Mean probability from which on a region is a tool though it does not enter end first: gauze along the border, a
 needle, the head of an instrument whose shaft is hidden."""
 REACH = 0.75
