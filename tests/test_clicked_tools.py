@@ -69,7 +69,7 @@ def search(folder, *clicks, finder=None, tool=known):
     """What a search adds to each frame."""
     steps = list(find_clicked(load_sequence(folder), clicks, tool, finder or Blind()))
     assert [step.done for step in steps] == list(range(1, steps[0].total + 1))
-    added = {step.frame: step.added for step in steps if step.added is not None}
+    added = {step.frame: step.region for step in steps if step.region is not None}
     assert list(added) == list(range(FRAMES))
     return added
 

@@ -174,10 +174,10 @@ def test_a_search_is_one_edit_that_can_be_undone_and_saved(edits, monkeypatch, t
     before = [edits.tool(i) for i in range(4)]
     steps = list(edits.find(ToolClick(1, 6, 6)))
     assert edits.unsaved == []  # searching changes nothing
-    edits.add({step.frame: step.added for step in steps if step.added.any()})
+    edits.change({step.frame: step.region for step in steps if step.region.any()}, True)
     assert edits.unsaved == [1, 3] and edits.tool(3)[6, 32] and (edits.tool(1) >= before[1]).all()
     assert edits.undo() and edits.unsaved == [] and not edits.undo()
-    edits.add({3: steps[3].added})
+    edits.change({3: steps[3].region}, True)
     assert edits.save() == [3] and tool(tiny_sequence / "masks", "000003.png")[6, 32]
 
 
@@ -237,6 +237,21 @@ def test_between_two_frames_of_a_search_other_jobs_run_and_undo_stops_it(edits, 
     work()
     assert edits.unsaved == [0] and not jobs.take(0)
     assert edits.undo() and not edits.undo()
+
+
+def test_a_click_that_erases_frees_tissue_in_all_frames(edits):
+    jobs, controls = JobQueue(), SimpleNamespace(corrected=SimpleNamespace(content=""))
+    editor = MaskEditor(edits, controls, None, jobs, lambda client, screen: None, lambda: None)
+    y, x = np.argwhere(edits.tool(0))[0]
+    before = [edits.tool(i) for i in range(4)]
+    editor.find(0, (float(x), float(y)), paint=False)
+    while "Freed in" not in controls.corrected.content:
+        for job in jobs.take(0):
+            job()
+    assert not edits.tool(0)[y, x] and 0 in edits.unsaved
+    assert all((edits.tool(i) <= before[i]).all() for i in range(4))
+    with pytest.raises(InputError, match="tissue that is masked"):
+        editor.find(0, (float(x), float(y)), paint=False)
 
 
 def test_an_error_ends_a_search(edits, monkeypatch):

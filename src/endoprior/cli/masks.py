@@ -48,20 +48,26 @@ class Masks(Command):
     """Points on tools that the masks of DATA miss: the frame, from 0, and px of the image. Such tools are found in all
     frames; pixels are only added."""
 
-    examples = ("DATA", "DATA --refine", "DATA --with sam2", "DATA --tool 12,310,205")
+    tissue: tuple[str, ...] = field(default=(), metadata={"metavar": "FRAME,X,Y ..."})
+    """Points on tissue that the masks of DATA take for a tool: the masked region there is freed in all frames; pixels
+    are only removed."""
+
+    examples = ("DATA", "DATA --refine", "DATA --with sam2", "DATA --tool 12,310,205", "DATA --tissue 12,80,40")
 
     def execute(self) -> None:
         """Find tools and write their masks."""
-        if self.tool and (self.refine or self.segmenter is not None):
-            other = "--refine" if self.refine else "--with"
-            raise input_error("--tool", f"no {other}", other, f"find the tools with {other} first, without --tool.")
+        clicked = [name for name, points in (("--tool", self.tool), ("--tissue", self.tissue)) if points]
+        other = [name for name, on in (("--refine", self.refine), ("--with", self.segmenter is not None)) if on]
+        if clicked and (other := [*other, *clicked[1:]]):
+            fix = f"call it with {other[0]} first, then without."
+            raise input_error(clicked[0], f"no {other[0]}", other[0], fix)
         from ..data import load_sequence
         from ..data.writer import writable_masks
 
         sequence = load_sequence(self.data)
         writable_masks(sequence)
-        if self.tool:
-            self._add_clicked(sequence)
+        if clicked:
+            self._correct(sequence)
         else:
             self._find_all(sequence)
         say(f"look at {self.data / SHEET}; to correct masks: `{command('view', self.data)}`")
@@ -91,26 +97,36 @@ class Masks(Command):
         if uncertain := uncertain_frames(rows):
             say(f"uncertain: frames {number_ranges(uncertain)}")
 
-    def _add_clicked(self, sequence: FrameSequence) -> None:
-        """Add the tools at the points of `--tool` to the masks of all frames."""
+    def _correct(self, sequence: FrameSequence) -> None:
+        """Add the tools at the points of `--tool` to the masks of all frames, or free the tissue at `--tissue`."""
         from ..data.found_tools import read_rows, write_rows
+        from ..tool_masks.clicked_tissue import free_clicked
         from ..tool_masks.clicked_tools import find_clicked, parse_click
+        from ..tool_masks.mask_store import MaskStore
 
-        clicks = [parse_click(text, "--tool") for text in self.tool]
-        changed = dict[int, float]()
-        with _replacing(sequence, {click.frame for click in clicks}) as (put, _, progress):
-            for step in find_clicked(sequence, clicks, lambda i: ~sequence.frame(i).tissue_mask):
-                progress("finding the tool", step.done, step.total)
-                i, added = step.frame, step.added
-                if i is None or added is None:
-                    continue
-                share, mask = float(added.mean()), ~sequence.frame(i).tissue_mask | added
+        adds = bool(self.tool)
+        option, points = ("--tool", self.tool) if adds else ("--tissue", self.tissue)
+        clicks = [parse_click(text, option) for text in points]
+        changed, camera = dict[int, float](), sequence.camera(0)
+        with _replacing(sequence, {click.frame for click in clicks}) as (put, work, progress):
+            regions = MaskStore(work, (camera.width, camera.height))
+            search = find_clicked if adds else free_clicked
+            for step in search(sequence, clicks, lambda i: ~sequence.frame(i).tissue_mask):
+                progress("finding the tool" if adds else "following the tissue", step.done, step.total)
+                if step.frame is not None and step.region is not None:
+                    regions.add(step.frame, step.region)
+            for i in range(len(sequence)):
+                tool, region = ~sequence.frame(i).tissue_mask, regions.mask(i)
+                share = float(region.mean()) * (1 if adds else -1)
+                mask = tool | region if adds else tool & ~region
                 changed |= {i: share} if share else {}
-                put(i, mask, mask, f"+{share:.1%}", is_new=share > 0 or not sequence.mask_files)
+                put(i, mask, mask, f"{share:+.1%}", is_new=bool(share) or not sequence.mask_files)
         if rows := read_rows(self.data):
             write_rows(self.data, [row.with_added(changed.get(row.frame, 0.0)) for row in rows])
-        most = max(changed.values(), default=0)
-        say(f"added in {len(changed)} of {len(sequence)} frames, at most {most:.1%} of a frame")
+        most = max(map(abs, changed.values()), default=0)
+        say(
+            f"{'added' if adds else 'freed'} in {len(changed)} of {len(sequence)} frames, at most {most:.1%} of a frame"
+        )
         if changed:
             say(f"changed: frames {number_ranges(changed)}")
 

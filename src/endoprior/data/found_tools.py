@@ -67,8 +67,9 @@ class FrameRow:
         return {name: value for name, value in asdict(self).items() if name != "moves_unmasked" or value}
 
     def with_added(self, share: float) -> FrameRow:
-        """The row when a share of the image, 0..1, is added to the mask."""
-        return replace(self, share=min(self.share + share, 1.0), moves_unmasked=self.moves_unmasked and not share)
+        """The row when a share of the image is added to the mask, or removed from it, -1..1."""
+        share_now = min(max(self.share + share, 0.0), 1.0)
+        return replace(self, share=share_now, moves_unmasked=self.moves_unmasked and not share)
 
 
 def write_rows(folder: Path, rows: Iterable[FrameRow]) -> None:

@@ -30,7 +30,7 @@ LEAST_PART_PX = 30
 
 @dataclass(frozen=True)
 class ToolClick:
-    """A click on a tool that the masks miss."""
+    """A click on a tool that the masks miss, or on tissue that they take for one."""
 
     frame: int  # Its place in the sequence, from 0
     x: float  # px of the image, 0 at its left edge
@@ -53,7 +53,7 @@ class SearchStep:
     done: int
     total: int  # Frames of both passes: those that teach, and all
     frame: int | None = None  # The frame that was searched; None while examples are gathered
-    added: Mask | None = None  # (H, W) True on tools that its mask misses
+    region: Mask | None = None  # (H, W) True on what its mask is to gain, or to lose
 
 
 def find_clicked(
@@ -70,18 +70,22 @@ def find_clicked(
 def check_clicks(sequence: FrameSequence, clicks: Sequence[ToolClick], tool: Callable[[int], Mask]) -> None:
     """Raise the errors of `find_clicked`."""
     for click in clicks:
-        subject = f"click {click.frame},{click.x:g},{click.y:g}"
-        if not 0 <= click.frame < len(sequence):
-            fix = "Name a frame of the sequence."
-            raise input_error(subject, f"a frame of 0..{len(sequence) - 1}", str(click.frame), fix)
-        mask = tool(click.frame)
-        height, width = mask.shape
-        if not (0 <= click.x < width and 0 <= click.y < height):
-            got = f"{click.x:g},{click.y:g}"
-            raise input_error(subject, f"a place in {width}x{height} px", got, "Choose a place in the image.")
-        if mask[int(click.y), int(click.x)]:
-            fix = "Choose a place that is not masked."
+        demand_in_image(click, sequence, tool)
+        if tool(click.frame)[int(click.y), int(click.x)]:
+            subject, fix = f"click {click.frame},{click.x:g},{click.y:g}", "Choose a place that is not masked."
             raise input_error(subject, "a tool that is not masked", "a masked pixel", fix)
+
+
+def demand_in_image(click: ToolClick, sequence: FrameSequence, tool: Callable[[int], Mask]) -> None:
+    """Raise InputError unless a click is in a frame of the sequence, and inside of its image."""
+    subject = f"click {click.frame},{click.x:g},{click.y:g}"
+    if not 0 <= click.frame < len(sequence):
+        fix = "Name a frame of the sequence."
+        raise input_error(subject, f"a frame of 0..{len(sequence) - 1}", str(click.frame), fix)
+    height, width = tool(click.frame).shape
+    if not (0 <= click.x < width and 0 <= click.y < height):
+        got = f"{click.x:g},{click.y:g}"
+        raise input_error(subject, f"a place in {width}x{height} px", got, "Choose a place in the image.")
 
 
 def _steps(

@@ -18,6 +18,7 @@ from ..data import FrameSequence
 from ..data.found_tools import drop_rows
 from ..data.writer import replace_masks
 from ..footage.carry_masks import CarriedEdit, carry_mask_edit
+from ..tool_masks.clicked_tissue import free_clicked
 from ..tool_masks.clicked_tools import SearchStep, ToolClick, find_clicked
 from .access_control import BRUSH_NODE, JobQueue
 
@@ -89,17 +90,26 @@ class MaskEdits:
         return done
 
     def find(self, click: ToolClick) -> Iterator[SearchStep]:
-        """Search every frame for the tool at a click that the masks miss; give what is found to `add`.
+        """Search every frame for the tool at a click that the masks miss; give what is found to `change`.
 
         Raises:
             InputError: the click is not in the image, or on a mask.
         """
         return find_clicked(self._sequence, [click], self.tool)
 
-    def add(self, added: Masks) -> None:
-        """Add pixels to the masks of some frames, as one step. Strokes that were not carried yet stay so."""
+    def free(self, click: ToolClick) -> Iterator[SearchStep]:
+        """Search every frame for the tissue at a click that the masks take for a tool; give it to `change`.
+
+        Raises:
+            InputError: the click is not in the image, or not on a mask.
+        """
+        return free_clicked(self._sequence, [click], self.tool)
+
+    def change(self, regions: Masks, paint: bool) -> None:
+        """Add regions to the masks of some frames, or remove them, as one step. Strokes not carried yet stay so."""
         self.begin()
-        masks = self._state.masks | {i: self.tool(i) | mask for i, mask in added.items()}
+        changed = {i: self.tool(i) | mask if paint else self.tool(i) & ~mask for i, mask in regions.items()}
+        masks = self._state.masks | changed
         self._state = self._state._replace(masks=masks)
 
     def undo(self) -> bool:
@@ -218,32 +228,37 @@ class MaskEditor:
             del self._last[browser]
 
     def _dab(self, event: viser.SceneClickEvent) -> None:
-        """A stroke of one point, or a search for the tool there."""
+        """A stroke of one point, or a search for the tool or the tissue there."""
         if self._listens and (here := self._spot(event.client, event.screen_pos)) is not None:
             if self._controls.find.value:
-                self.find(*here)
+                self.find(*here, paint=self._paints(event.modifier == ERASING_KEY))
                 return
             self.edits.begin()
             self._draw(here[0], [here[1]], event.modifier == ERASING_KEY)
 
+    def _paints(self, erasing_key: bool) -> bool:
+        return self._controls.erase.value == erasing_key  # the key reverses the control
+
     def _draw(self, frame: int, points: list[tuple[float, float]], erasing_key: bool) -> None:
-        paint = self._controls.erase.value == erasing_key  # the key reverses the control
-        self.edits.draw(frame, points, self._controls.radius.value, paint)
+        self.edits.draw(frame, points, self._controls.radius.value, self._paints(erasing_key))
         self._say("")
 
     # Searching. A frame is searched in a job of its own, so that the page stays responsive between two of them.
 
-    def find(self, frame: int, place: tuple[float, float]) -> None:
-        """Search all frames for the tool at a place (x, y) of a mask, px, in place of a search that is on.
+    def find(self, frame: int, place: tuple[float, float], paint: bool = True) -> None:
+        """Search all frames for what is at a place (x, y) of a mask, px, in place of a search that is on.
 
+        Args:
+            paint: it is a tool, to be masked; else tissue, to be freed.
         Raises:
-            InputError: that place is masked already.
+            InputError: that place is masked already, or not masked.
         """
-        self._search = search = self.edits.find(ToolClick(frame, *place))
-        self._continue(search, {})
+        click = ToolClick(frame, *place)
+        self._search = search = self.edits.find(click) if paint else self.edits.free(click)
+        self._continue(search, {}, paint)
 
-    def _continue(self, search: Iterator[SearchStep], added: Masks) -> None:
-        """Search one more frame, unless the search was stopped; when all are, add what was found in them."""
+    def _continue(self, search: Iterator[SearchStep], found: Masks, paint: bool) -> None:
+        """Search one more frame, unless the search was stopped; when all are, change the masks by what was found."""
         if search is not self._search:
             return
         try:
@@ -253,15 +268,16 @@ class MaskEditor:
             self._say("")
             raise
         if step is not None:
-            if step.frame is not None and step.added is not None and step.added.any():
-                added[step.frame] = step.added
-            self._controls.corrected.content = f"Finding the tool: {step.done} of {step.total}. *Undo* stops."
-            self._jobs.put(lambda: self._continue(search, added), surely=True)
+            if step.frame is not None and step.region is not None and step.region.any():
+                found[step.frame] = step.region
+            what = "Finding the tool" if paint else "Following the tissue"
+            self._controls.corrected.content = f"{what}: {step.done} of {step.total}. *Undo* stops."
+            self._jobs.put(lambda: self._continue(search, found, paint), surely=True)
             return
         self._search = None
-        if added:
-            self.edits.add(added)
-        self._say(f"Found in {_frames(sorted(added))}." if added else "Nothing was found.")
+        if found:
+            self.edits.change(found, paint)
+        self._say(f"{'Found' if paint else 'Freed'} in {_frames(sorted(found))}." if found else "Nothing was found.")
 
     # Buttons.
 

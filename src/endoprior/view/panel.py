@@ -80,8 +80,8 @@ class Panel:
             self.correct = gui.add_checkbox("Correct by painting", False)
             self.erase = gui.add_checkbox("Erase", False, hint="Or hold Shift.")
             self.radius = gui.add_slider("Brush radius, px", 1, max(width // 8, 2), 1, max(width // 50, 1))
-            hint = "Click on a tool that the masks miss: it is found in all frames."
-            self.find = gui.add_checkbox("Click finds a tool", False, hint=hint)
+            hint = "On a tool that the masks miss, or with Erase on tissue that is masked: done in all frames."
+            self.find = gui.add_checkbox("Click finds the region", False, hint=hint)
             self.undo = gui.add_button("Undo")
             self.carry = gui.add_button("Carry to other frames", hint="Moves the correction along with the image.")
             self.save_masks = gui.add_button("Save masks")
