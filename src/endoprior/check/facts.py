@@ -29,6 +29,7 @@ from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
 from ..footage.components import InOrder
 from ..footage.known_facts import KnownFacts
+from ..footage.masked_tissue import MaskedTissue, find_masked_tissue
 from ..footage.overlays import find_static_overlays, without_strokes
 from ..footage.pose_fit import PoseFit, View, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
@@ -47,6 +48,7 @@ CERTAIN = 0.5  # least certainty to report masks as inverted
 POINT_FRAMES = 24  # largest number of training frames for the initial points
 LABEL_ON_TISSUE = 0.75  # least share of a text box that the masks mark as tissue
 COMPARED = 3  # stereo pairs to compare, evenly spaced
+USUAL_RATE = 25.0  # frames/s of a sequence that does not say it
 BINS = 80  # of the histogram of depth
 EVERY = 7  # the distribution of depth uses every 7th pixel
 Mask = NDArray[np.bool_]
@@ -60,6 +62,7 @@ class MaskFacts:
     polarity: Polarity  # of the masks as read: `tool_is_high` False means that tissue and tool are swapped
     confidence: NDArray[np.float64]
     """(T,) how sure the program was that found them, 0..1; NaN where no program did, or a person corrected them."""
+    tissue_like: MaskedTissue | None  # a masked region that moves with the tissue in nearly all frames
 
     @property
     def inverted(self) -> bool:
@@ -195,7 +198,14 @@ def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool:
     masked = masked_border(outline, images, (frame.tissue_mask for frame in decoded))
     view = max(int((~masked).sum()), 1)
     tool_fraction = np.array([1 - frame.tissue_mask.sum() / view for frame in frames])
-    masks = MaskFacts(tool_fraction, polarity, _confidence(sequence))
+    tissue_like = find_masked_tissue(
+        count,
+        sequence.frames_per_second or USUAL_RATE,
+        lambda i: sequence.frame(i).rgb_u8,
+        lambda i: ~sequence.frame(i).tissue_mask & ~masked,
+        pool.map,
+    )
+    masks = MaskFacts(tool_fraction, polarity, _confidence(sequence), tissue_like)
     tissue = [masks.tissue(frame) for frame in samples]
     step = -(-count // MOTION_FRAMES)
     followed = [sequence.frame(i) for i in range(0, count, step)]

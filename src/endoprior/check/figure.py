@@ -43,19 +43,20 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
 
     Rows: frames with tools outlined in red and borders in yellow; their depth; depth histogram and curves over time,
     with the frames of findings marked; initial points from the camera and from the side, and the findings; the frames
-    whose masks are least certain, if there are uncertain ones.
+    whose masks are doubtful, if any are.
     """
     # Use a canvas directly: selecting a Matplotlib backend would change the whole process.
     confidence = facts.masks.confidence
-    unsure = sorted(facts.masks.uncertain, key=lambda i: (confidence[i], i))[:MOST_UNSURE]
-    figure = Figure(figsize=(15, 14 + UNSURE_HEIGHT * bool(unsure)), layout="constrained", dpi=100)
+    like = facts.masks.tissue_like
+    unsure = sorted(facts.masks.uncertain, key=lambda i: (confidence[i], i))[: MOST_UNSURE - (like is not None)]
+    figure = Figure(figsize=(15, 14 + UNSURE_HEIGHT * bool(unsure or like)), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     camera = facts.camera
     # A file name may hold bytes that are not text, and characters that Matplotlib would parse as formulas.
     name = os.fsencode(facts.path.name).decode("utf-8", "backslashreplace")
     title = f"{name}   {facts.frames} frames of {camera.width} x {camera.height} px"
     figure.suptitle(title, fontsize=13, parse_math=False)
-    heights = [5.6, 3.4, 4.8, *([UNSURE_HEIGHT] if unsure else [])]
+    heights = [5.6, 3.4, 4.8, *([UNSURE_HEIGHT] if unsure or like else [])]
     images, curves, space, *rest = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
     _draw_frames(images, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
     left, right = curves.subfigures(1, 2, squeeze=False, width_ratios=[1, 2.4]).flat
@@ -64,8 +65,9 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     axes = space.subplots(1, 3, width_ratios=[1, 1.15, 1.45])
     _draw_cloud(axes[0], axes[1], facts)
     _draw_findings(axes[2], facts, findings)
-    if unsure:
-        _draw_unsure(rest[0], [sequence.frame(i) for i in unsure], facts)
+    if unsure or like:
+        shown = [*([like.frame] if like else []), *unsure]
+        _draw_doubtful(rest[0], [sequence.frame(i) for i in shown], facts)
     save_figure(figure, path)
 
 
@@ -94,14 +96,18 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
     bar.ax.tick_params(labelsize=8)
 
 
-def _draw_unsure(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
-    """Frames with their masks outlined and their confidence."""
-    axes = part.subplots(1, MOST_UNSURE, squeeze=False)[0]
+def _draw_doubtful(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
+    """Frames with their masks outlined: one with what moves like tissue, if anything does, then the least certain."""
+    axes, like = part.subplots(1, MOST_UNSURE, squeeze=False)[0], facts.masks.tissue_like
     for axis in axes:
         axis.set_axis_off()
-    for axis, frame in zip(axes, frames, strict=False):  # fewer frames leave places empty
+    for place, (axis, frame) in enumerate(zip(axes, frames, strict=False)):  # fewer frames leave places empty
         axis.imshow(_outlined(frame, facts.border.masked))
-        axis.set_title(f"frame {frame.index}: unsure, {facts.masks.confidence[frame.index]:.2f}", fontsize=9)
+        what = f"unsure, {facts.masks.confidence[frame.index]:.2f}"
+        if like and place == 0:
+            axis.plot(like.x, like.y, marker="x", markersize=12, markeredgewidth=2.5, color=FLAG_COLOR)
+            what = "x moves with the tissue"
+        axis.set_title(f"frame {frame.index}: {what}", fontsize=9)
 
 
 def _outlined(frame: Frame, border: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -116,6 +116,11 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         what = f"the program that found the tools is unsure in {_frames(unsure)}"
         fix = f"look at them and correct them: `{command('view', facts.path)}`"
         yield Finding("uncertain-masks", "warning", what, fix, unsure)
+    if (like := facts.masks.tissue_like) and not masks.inverted:
+        what = f"what is masked at x {like.x}, y {like.y} of frame {like.frame} moves with the tissue in every frame"
+        free = command("masks", facts.path, "--tissue", f"{like.frame},{like.x},{like.y}")
+        fix = f"nothing if it is a tool; else `{free}`"
+        yield Finding("masked-tissue", "warning", what, fix, (like.frame,))
 
 
 def _depth(facts: Facts) -> Iterator[Finding]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import spread
+from ..footage.background_motion import difference_from_background
 from ..footage.components import InOrder
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
@@ -31,7 +32,6 @@ LEAST_PX, TIMES_MEDIAN = 2.0, 8.0
 NEAR_TOOL_PX = 8  # motion this near to a mask is that of its tool, or of tissue that it pulls
 LEAST_SHARE = 0.01  # smaller regions, as a share of the view, are not reported
 SMOOTH_PX = 2.0
-ROUNDS, EVERY = 8, 7  # rounds of the robust fit; every so many pixels take part in it
 Image, Mask = NDArray[np.uint8], NDArray[np.bool_]
 
 
@@ -80,26 +80,6 @@ def moves_unmasked(first: Image, later: Image, view: Mask, tool: Mask) -> bool:
     moving = (cv2.GaussianBlur(difference, (0, 0), SMOOTH_PX) > most) & view & ~near
     moving = np.asarray(cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, disk(3)), np.uint8)
     return bool(entering_regions(moving, view).sum() > LEAST_SHARE * view.sum())
-
-
-def difference_from_background(flow: NDArray[np.float32], background: Mask) -> tuple[NDArray[np.float32], float]:
-    """(h, w) px by which flow (h, w, 2) differs from a smooth motion that explains most of the background (h, w).
-
-    The second value is the median there.
-    """
-    height, width = background.shape
-    y, x = (each.ravel() for each in np.mgrid[:height, :width] / np.array([height, width])[:, None, None] - 0.5)
-    terms, moved = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1), flow.reshape(-1, 2)
-    some = np.flatnonzero(background)[::EVERY]
-    weight, left, coefficients = np.ones(len(some)), np.zeros(len(some)), np.zeros((terms.shape[1], 2))
-    for _ in range(ROUNDS):
-        weighted = terms[some] * weight[:, None]
-        normal = weighted.T @ terms[some] + 1e-6 * np.eye(terms.shape[1])
-        coefficients = np.linalg.solve(normal, weighted.T @ moved[some])
-        left = np.hypot(*(moved[some] - terms[some] @ coefficients).T)
-        weight = 1 / (1 + (left / max(1.5 * np.median(left), 0.1)) ** 2)
-    difference = np.hypot(*(moved - terms @ coefficients).T).reshape(height, width)
-    return difference.astype(np.float32), float(np.median(left))
 
 
 def _agree(forward: NDArray[np.float32], backward: NDArray[np.float32]) -> Mask:
