@@ -1,6 +1,7 @@
 """`endoprior scan`: every disturbance of a phantom is found at its frames, and nothing else is."""
 
 import json
+import math
 import shutil
 
 import cv2
@@ -14,7 +15,7 @@ from endoprior.footage.scenes import breaks, half_stays, jumps, places_differ, s
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline.choice import choose_segment
 from endoprior.prepare.scan import scan_video
-from endoprior.prepare.segments import as_json, from_json, stretches_of
+from endoprior.prepare.segments import as_json, best_start, from_json, stretches_of
 
 RATE = 10.0
 EVENTS = "blur:12-17,white-out:30-37,out-of-body:60-74,cut:90"
@@ -149,3 +150,35 @@ def test_bad_events_are_named(events, tmp_path, capsys):
     assert main(["phantom", str(tmp_path / "data"), "--events", events]) == 2
     assert "--events" in capsys.readouterr().err
     assert not (tmp_path / "data").exists()
+
+
+def looked(weights, problems=(), unknown=(), rate=5.0):
+    """What `scan.json` holds of so many looks."""
+    count = len(weights)
+    looks = {
+        "seconds": [i / rate for i in range(count)],
+        "weight": list(weights),
+        "problem": ["blur" if i in problems else "" for i in range(count)],
+        "shift": [None if i in unknown else 0.01 for i in range(count)],
+    }
+    return {"seconds": count / rate, "looks": looks}
+
+
+def test_the_best_seconds_of_a_span_are_those_that_are_clear_and_followed():
+    clear = looked([1.0] * 50)
+    assert best_start(clear, (0.0, math.inf), 3.0) == 0.0 and best_start(clear, (2.0, 9.0), 3.0) == 2.0
+    assert best_start(looked([1.0] * 50, problems=range(10, 30)), (1.0, 10.0), 3.0) == 6.0
+    assert best_start(looked([0.5] * 20 + [1.0] * 30), (0.0, 10.0), 3.0) == 4.0
+    assert best_start(looked([1.0] * 50, unknown=range(25)), (0.0, 10.0), 3.0) == 5.0
+    assert best_start(clear, (0.0, 10.0), 30.0) == 0.0 and best_start(clear, (11.0, 12.0), 1.0) == 11.0
+
+
+def test_the_best_seconds_are_those_of_a_slow_loop():
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        weights = rng.random(40).round(2)
+        scanned, seconds = looked(weights), int(rng.integers(2, 20)) / 5
+        length = round(seconds * 5)
+        means = [float(np.mean(weights[i : i + length])) for i in range(40 - length + 1)]
+        found = best_start(scanned, (0.0, 8.0), seconds)
+        assert means[round(found * 5)] >= max(means) - 0.01  # the first of nearly equal ones

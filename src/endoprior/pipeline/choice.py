@@ -19,7 +19,7 @@ from ..data.files import read_json
 from ..footage.components import Image
 from ..prepare.first_pass import source_facts
 from ..prepare.scan import scan_video
-from ..prepare.segments import Stretch, as_json, best_segment, from_json, segments_of
+from ..prepare.segments import Stretch, as_json, best_segment, best_start, from_json, segments_of
 
 SCAN = "scan.json"  # file in the output folder; the timeline lies beside it
 MOST_NAMED = 3  # other segments that are named
@@ -47,6 +47,10 @@ class Choice:
     def span(self) -> tuple[float, float]:
         """Start and end of what is used, s."""
         return self.segments[self.number - 1].best if self.number else (0.0, math.inf)
+
+    def best_start(self, seconds: float) -> float:
+        """Where the best so many seconds of what is used begin, s."""
+        return best_start(self.scanned, self.span, seconds)
 
     def words(self, video: Path, out: Path, options: Mapping[str, tuple[str, ...]] = MappingProxyType({})) -> list[str]:
         """What is used, why, and the commands for the other segments; nothing if the whole video is one segment."""

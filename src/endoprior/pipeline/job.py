@@ -158,6 +158,9 @@ def make_job(
         choice = choose_segment(video, out, prepare.folder_rate, segment)
     start, end = choice.span if choice else (prepare.start, prepare.end)
     part = choose_part(source.times, rate, prepare.frames_per_second, start, end, most, usual)
+    if choice and not part.is_whole:  # so many seconds, but the best ones
+        start = choice.best_start(part.end - start)
+        part = choose_part(source.times, rate, prepare.frames_per_second, start, end, most, usual)
     width = min(prepare.max_width or PREVIEW_WIDTH, PREVIEW_WIDTH) if preview else prepare.max_width
     poses = WITHOUT_COLMAP["auto"] if preview and prepare.poses == "auto" else prepare.poses
     chosen = replace(

@@ -148,6 +148,28 @@ def as_json(scan: Scan) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def best_start(scanned: dict[str, Any], span: tuple[float, float], seconds: float) -> float:
+    """Where so many seconds of a span are clearest and can be followed best, s; the first of nearly equal places.
+
+    Args:
+        scanned: what `as_json` gave. span: start and end, s.
+    """
+    looks = scanned["looks"]
+    times = np.array(looks["seconds"])
+    inside = np.flatnonzero((times >= span[0] - 1e-6) & (times < span[1] - 1e-6))
+    if not len(inside):
+        return span[0]
+    known = np.array([looks["shift"][i] is not None for i in inside])
+    known[:1] = True
+    clear = np.array([looks["weight"][i] * (not looks["problem"][i]) for i in inside])
+    worth = np.concatenate([[0.0], np.cumsum(clear * np.where(known, 1, UNKNOWN_MOTION))])
+    starts = times[inside]
+    ends = np.searchsorted(starts, starts + seconds - 1e-6)
+    fits = starts + seconds <= min(span[1], scanned["seconds"]) + 1e-6
+    mean = (worth[ends] - worth[:-1])[fits] / np.maximum(ends - np.arange(len(ends)), 1)[fits]
+    return float(starts[fits][np.argmax(np.round(mean, 2))]) if len(mean) else span[0]
+
+
 def from_json(scanned: dict[str, Any]) -> list[Stretch]:
     """The stretches of a video, in order, from what `as_json` gave."""
     good = [Stretch(each["start"], each["end"], "", each["score"], tuple(each["used"])) for each in scanned["segments"]]
