@@ -238,9 +238,11 @@ def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
         lines += [(line, "black", "normal") for line in [*textwrap.wrap(finding.what, WRAPPED_AT), ""]]
     if not findings:
         lines += [("no problems", "#2e8b57", "bold"), ("", "black", "normal")]
-    for name, value in table(facts):
-        rows = textwrap.wrap(value, WRAPPED_AT - 17) or [""]
-        lines += [(f"{name if i == 0 else '':<17}{row}", "#3a5a78", "normal") for i, row in enumerate(rows)]
+    told = table(facts)
+    column = max(len(name) for name, _ in told) + 1
+    for name, value in told:
+        rows = textwrap.wrap(value, WRAPPED_AT - column) or [""]
+        lines += [(f"{name if i == 0 else '':<{column}}{row}", "#3a5a78", "normal") for i, row in enumerate(rows)]
     for row, (text, color, weight) in enumerate(lines[:ROWS]):
         at = {"x": 0, "y": 1 - row / ROWS, "va": "top", "transform": axis.transAxes}
         axis.text(**at, s=text, parse_math=False, color=color, weight=weight, fontsize=7.5, family="monospace")

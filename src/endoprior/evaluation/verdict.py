@@ -91,7 +91,7 @@ def _images(scores: Mapping[str, float]) -> Iterator[tuple[int, str]]:
         yield _graded(-tissue, [-limit for limit in TISSUE_DB]), told
         return
     if tissue < BLURRED_DB and over_mean < WRONG_OVER_MEAN_DB:
-        yield WRONG, f"{told}, hardly better than the mean of all frames ({tissue - over_mean:.1f} dB)"
+        yield WRONG, f"{told}; the mean of all frames alone has {tissue - over_mean:.1f} dB"
     elif tissue < BLURRED_DB and over_mean - over_flow < FOLLOWED_DB:
         yield DOUBTFUL, f"{told}, and optical flow does not follow the video either"
     else:

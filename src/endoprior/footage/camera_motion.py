@@ -77,7 +77,7 @@ class CameraMotion:
         start = "the first frame" if count == len(self.stretch) else f"the first of up to {count} frames in a row"
         usual = np.median(self.pixels_per_frame[known]) if known.any() else 0
         return (
-            f"the whole image shifts by up to {self.path_px.max():.0f} px from {start} "
+            f"the view moves by up to {self.path_px.max():.0f} px from {start} "
             f"({usual:.1f} px a step; {known.mean() if len(known) else 1.0:.0%} of steps explained)"
         )
 

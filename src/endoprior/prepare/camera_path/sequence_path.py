@@ -373,7 +373,7 @@ def _estimate_notes(reason: str, path: CameraPath, lens: Lens) -> list[str]:
     how = f"; by the path, its shift is {path.motion.reason}" if path.motion and len(path.motion.parts_px) else ""
     notes = [f"{moves}: {reason}{how}; the estimated path reaches {reach:.0f} {unit} from its start"]
     if path.shape is not None:
-        by = "triangulated points" if path.shape.pixels else "the light of a tube"
+        by = "triangulated points" if path.shape.pixels else "brightness around a dark place, as in a tube"
         notes.append(f"the way ahead fixes the shape of relative depth: d^{path.shape.power:.1f}, and {by}")
     if path.translation_std is not None and path.rotation_std is not None and np.isfinite(path.translation_std).any():
         moved, turned = np.nanmedian(path.translation_std), np.nanmedian(path.rotation_std)
