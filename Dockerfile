@@ -9,7 +9,8 @@ COPY src src
 # The image has no repository to read the commit from.
 ARG COMMIT=""
 RUN if [ -n "$COMMIT" ]; then echo "$COMMIT" > src/endoprior/commit.txt; fi \
- && pip install --no-cache-dir -c constraints.txt . --extra-index-url https://download.pytorch.org/whl/cpu \
+ && pip install --no-cache-dir -c constraints.txt torch --no-deps --index-url https://download.pytorch.org/whl/cpu \
+ && pip install --no-cache-dir -c constraints.txt . \
  && rm -rf build \
  && mkdir -m 1777 /cache /data
 # Any user may run it; no Python imports files of the data. Compiled kernels and downloaded weights go to /cache: keep it in a volume.

@@ -8,6 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Two processes, because most of a first run is compiling kernels, which takes one core. Files stay together.
 QUICK := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+HAS_CHROMIUM := { test -n "$$ENDOPRIOR_CHROMIUM" || command -v chromium || command -v google-chrome; } >/dev/null 2>&1
 export PYTHON TORCH_INDEX
 
 .PHONY: demo test coverage test-all test-faults style lint browser bench figures docs clean
@@ -16,11 +17,12 @@ demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
 	@echo "To type endoprior without its folder: source $(BIN)/activate"
 
-test: $(VENV)/.test-installed style browser
+test: $(VENV)/.test-installed style
+	@$(HAS_CHROMIUM) || echo "No Chromium: tests of viewer and player will be skipped. Fix: make browser"
 	$(QUICK)
 
 # Which lines the quick tests run; compiled kernels count as not run.
-coverage: $(VENV)/.test-installed browser
+coverage: $(VENV)/.test-installed
 	$(QUICK) --cov --cov-report=
 	$(BIN)/python -m coverage report --skip-covered --sort=cover
 
@@ -40,14 +42,14 @@ style: $(VENV)/.test-installed
 
 lint: style
 	$(BIN)/pyright
+	$(BIN)/python tools/check_examples.py
 
-# The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
-# possible without asking; otherwise those tests are skipped, and say so.
+# The viewer and the player are tested in headless Chromium: this installs Debian's package where there is none.
 browser:
-	@command -v chromium >/dev/null || command -v google-chrome >/dev/null || test -n "$$ENDOPRIOR_CHROMIUM" || \
-	  { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get -qq update && \
-	    DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends chromium >/dev/null; } || \
-	  echo "No Chromium here and none could be installed: browser tests will be skipped."
+	@$(HAS_CHROMIUM) || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null; } || \
+	  { echo "Chromium: expected a browser or rights to install it, got none. Fix: sudo apt-get install chromium" >&2; exit 2; }
+	@$(HAS_CHROMIUM) || { apt-get -qq update && \
+	  DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends chromium >/dev/null; }
 
 bench: $(VENV)/.installed
 	$(BIN)/python bench/run.py --baseline bench/baseline.json $(BENCH)

@@ -1,14 +1,16 @@
 """Make the pictures of the documentation again: `make figures`, or `python bench/figures.py WORK`.
 
 Writes docs/images/report.jpg from the demo, player.jpg and viewer.jpg from its scene in headless Chromium, and
-own_video.jpg from the two clips that `ENDOPRIOR_DATA` holds (`bowel_lift_stereo_sbs.mp4` with its .json,
-`mono_endo.mp4`). WORK keeps sequences and runs; what is there is not made again. Pictures of benchmarks come from
-bench/publish.py.
+own_video.jpg, length.jpg, moving_pyvista.jpg and moving_blender.jpg from the clips that `ENDOPRIOR_DATA` holds
+(`bowel_lift_stereo_sbs.mp4` with its .json, `mono_endo.mp4`, `bowel_lift`). The last two need PyVista, and Blender as
+tests/programs.py finds it. WORK keeps sequences and runs; what is there is not made again. Pictures of benchmarks come
+from bench/publish.py.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -25,6 +27,14 @@ PAGE_SECONDS = 12.0
 """A page drawn without a graphics card takes its time."""
 CLIPS = {"stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97), "mono": ("mono_endo.mp4", None, 169)}
 """Video, calibration and the held-out frame that is shown."""
+LENGTH, LENGTH_FRAMES = ((230, 140), (380, 100)), (0, 46, 80)
+"""Two points of the first frame of `bowel_lift`, px, and the frames that are shown."""
+
+MOST_MOVED_MM = 60.0
+"""End of the color scale of its displacement."""
+IN_BLENDER = (0, 80)
+"""Frames of `bowel_lift` that Blender shows."""
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 
 def endoprior(*args: object) -> None:
@@ -61,9 +71,83 @@ def own_video(work: Path, data: Path) -> None:
     save("own_video.jpg", np.vstack(rows))
 
 
+def length(work: Path, data: Path) -> None:
+    """A distance of two points of the tissue over time, with its range, beside three frames that show them."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    run, measures, tracks = (work / f"length_{part}" for part in ("run", "measures", "tracks"))
+    points = work / "length_points.csv"
+    points.write_text("x,y,frame\n" + "".join(f"{x},{y},0\n" for x, y in LENGTH), encoding="utf-8")
+    if not (run / "metrics.json").exists():
+        endoprior("train", data / "bowel_lift", run, "--preset", "preview", "--no-networks")
+    for out, name in ((measures, "measures"), (tracks, "tracks")):
+        if not out.exists():
+            endoprior("export", run, out, "--format", name, "--points", points)
+    table = np.genfromtxt(measures / "measures.csv", delimiter=",", names=True)
+    seconds, distance, half = (table[name] for name in ("seconds", "distance_mm", "distance_range95_mm"))
+    pixels = np.load(tracks / "tracks.npz")["pixels"]
+    figure = Figure(figsize=(12.8, 3.2), layout="constrained", dpi=100)
+    FigureCanvasAgg(figure)
+    *shown, curve = figure.subplots(1, 4, width_ratios=[1, 1, 1, 1.5])
+    images = sorted((data / "bowel_lift" / "images").iterdir())
+    for axis, frame in zip(shown, LENGTH_FRAMES, strict=True):
+        axis.imshow(cv2.imread(str(images[frame]))[..., ::-1])
+        axis.plot(*pixels[frame].T, "o-", color="yellow", linewidth=1.5, markersize=4)
+        axis.set_title(f"{seconds[frame]:.1f} s: {distance[frame]:.1f} ± {half[frame]:.1f} mm", fontsize=10)
+        axis.set_axis_off()
+        curve.axvline(seconds[frame], color="gray", linewidth=0.8, linestyle=":")
+    curve.fill_between(seconds, distance - half, distance + half, color="C0", alpha=0.25, linewidth=0)
+    curve.plot(seconds, distance, color="C0")
+    curve.set(xlabel="s", ylabel="mm", title="distance, and where 95 % of the true ones lie")
+    curve.title.set_fontsize(10)
+    curve.grid(alpha=0.3)
+    figure.savefig(work / "length.png")
+    save("length.jpg", cv2.imread(str(work / "length.png")))
+
+
+def moving_in_pyvista(work: Path) -> None:
+    """How far the surface of `bowel_lift` has moved, over time, as PyVista shows `surface.pvd`."""
+    try:
+        import pyvista
+    except ImportError:
+        print("moving_pyvista.jpg: left as it is, because there is no PyVista")
+        return
+    from endoprior import load_scene
+
+    camera, shown = load_scene(work / "length_run").cameras[0], []
+    reader = pyvista.get_reader(str(work / "length_measures" / "surface.pvd"))
+    for frame in LENGTH_FRAMES:
+        plotter = pyvista.Plotter(off_screen=True, window_size=(640, 512))
+        reader.set_active_time_value(reader.time_values[frame])
+        bar = {"title": "displacement, mm", "color": "white", "fmt": "%.0f"}
+        look = {"cmap": "turbo", "clim": (0, MOST_MOVED_MM), "ambient": 0.4, "scalar_bar_args": bar}
+        plotter.add_mesh(reader.read()[0], scalars="displacement", **look)
+        plotter.camera.position, plotter.camera.focal_point, plotter.camera.up = (0, 0, 0), (0, 0, 1), (0, -1, 0)
+        plotter.camera.view_angle = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy)))
+        shown.append(plotter.screenshot(return_img=True)[..., ::-1])
+    save("moving_pyvista.jpg", np.hstack(shown))
+
+
+def moving_in_blender(work: Path) -> None:
+    """The surface of `bowel_lift` in the OpenUSD stage, as Blender renders it through the stage's camera."""
+    from programs import blender, open_in_blender
+
+    if not blender():
+        print("moving_blender.jpg: left as it is, because there is no Blender")
+        return
+    stage, shown = work / "moving.usdz", []
+    if not stage.exists():
+        endoprior("export", work / "length_run", stage, "--mesh-step", 4)
+    for frame in IN_BLENDER:
+        picture = (work / f"blender_{frame}.png").absolute()
+        open_in_blender(stage.absolute(), work.absolute(), [frame], str(picture))
+        shown.append(cv2.imread(str(picture)))
+    save("moving_blender.jpg", np.hstack(shown))
+
+
 def pages(work: Path) -> None:
     """The player and the viewer in headless Chromium, both with the demo's scene."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     from browser import chromium_path, open_page
 
     if chromium_path() is None:
@@ -79,8 +163,8 @@ def pages(work: Path) -> None:
     command = [sys.executable, "-m", "endoprior", "view", "demo/run", "--port", str(PORT)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, encoding="utf-8", cwd=work) as viewer:
         try:
-            print(viewer.stdout.readline().strip())
-            with open_page(f"http://127.0.0.1:{PORT}", width=1100, height=760) as page:
+            address = next(found[0] for line in viewer.stdout if (found := re.search(r"http://\S+", line)))
+            with open_page(address, width=1100, height=760) as page:
                 time.sleep(PAGE_SECONDS)
                 page.evaluate("document.querySelectorAll('[class*=Notification-close]').forEach(b => b.click())")
                 time.sleep(1.0)
@@ -98,8 +182,11 @@ def main() -> None:
     pages(work)
     if data and all((Path(data) / video).exists() for video, _, _ in CLIPS.values()):
         own_video(work, Path(data))
+        length(work, Path(data))
+        moving_in_pyvista(work)
+        moving_in_blender(work)
     else:
-        print("own_video.jpg: left as it is, because ENDOPRIOR_DATA does not hold the two clips")
+        print("pictures of clips: left as they are, because ENDOPRIOR_DATA does not hold them")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import scenes
 import torch
 from torch import Tensor
 
+import endoprior
 from endoprior.core.types import Camera, RenderOutput, Splats
 from endoprior.model.basis import BasisMotion, basis_offsets
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
@@ -128,6 +129,33 @@ def rendering(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     for size in sizes:
         measured += kept_rows(size)
     return measured
+
+
+def public(sizes: tuple[common.Size, ...]) -> list[common.Row]:
+    """`endoprior.rasterize`, forward and backward to every input, beside the same in plain torch: two rows a size."""
+    measured = []
+    for size in sizes:
+        if size.num <= TORCH_MOST:
+            measured += common.rows("rasterize", common.race(*public_steps(size)), size.num, (size.width, size.height))
+    return measured
+
+
+def public_steps(size: common.Size) -> tuple[common.Steps, common.Steps]:
+    splats, camera = scenes.splats(size)
+    inputs = [getattr(splats, name).requires_grad_() for name in ("means", "quats", "scales", "opacities", "sh")]
+    matrix = torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]])
+    view, background, cotangent = torch.eye(4)[None], torch.zeros(3), torch.randn(size.height, size.width, 3)
+
+    def ours(_: object) -> Tensor:
+        return endoprior.rasterize(*inputs, view, matrix, size.width, size.height, sh_degree=3)[0][0]
+
+    def theirs(_: object) -> Tensor:
+        return plain.rasterize(splats, camera, background=background).color
+
+    def backward(image: Tensor) -> tuple[Tensor, ...]:
+        return torch.autograd.grad(image, inputs, cotangent)
+
+    return {"forward": ours, "backward": backward}, {"forward": theirs, "backward": backward}
 
 
 def kept_rows(size: common.Size) -> list[common.Row]:

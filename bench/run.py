@@ -28,6 +28,7 @@ STAGES: dict[str, common.Measure] = {
     "binning": rendering.binning,
     "compositing": rendering.compositing,
     "ops": ops.measure,
+    "rasterize": rendering.public,
     "rendering": rendering.rendering,
     "stereo": stereo.measure,
     "viewer": viewer.measure,

@@ -10,7 +10,7 @@ from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 
 
 class LinearMotion(Motion):

@@ -10,7 +10,7 @@ from endoprior.core.config import Config
 from endoprior.core.ranges import Range
 from endoprior.training.ops import TrainingOps
 from endoprior.training.own_method import OwnMethod
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 
 AREA_PX = 8
 

@@ -138,7 +138,7 @@ OUTPUTS = [
         for what, out, says, steps in PLACES
     ),
     Case("phantom into this empty folder", given("phantom . --frames 2"), (".", "name")),
-    with_data("train into its own data", "train data data", "data", "files in it"),
+    with_data("train into its own data", "train data data", "data", "got the input"),
     with_data("check draws into a folder", "check data --out data", "--out", ".png"),
     Case(
         "check draws over a folder",

@@ -162,7 +162,7 @@ PARTS = [
     ),
     Case("a network that is nowhere", beside("--depth", "depth-anything:./nowhere"), ("nowhere",)),
     Case("a network of garbage", beside("--depth", "depth-anything:net", *GARBAGE), ("net",)),
-    Case("the video is the output", preparing("clip.mkv"), ("clip.mkv", "a file")),
+    Case("the video is the output", preparing("clip.mkv"), ("clip.mkv", "got the input")),
     Case("an output that is in use", preparing("out", put("out/x", "x")), ("out", "files in it")),
     Case("an output below a file", preparing("clip.mkv/out"), ("clip.mkv/out", "a path")),
     Case("an output where nothing can be", preparing("/proc/x/out"), ("/proc/x/out", "a path")),

@@ -90,7 +90,7 @@ def case_is_ignored() -> Iterator[None]:
 @contextmanager
 def windows_files() -> Iterator[None]:
     """Windows: open files stay, folders are not opened or replaced, text is not UTF-8, some names are taken."""
-    with pytest.MonkeyPatch.context() as patch, case_is_ignored():
+    with case_is_ignored(), pytest.MonkeyPatch.context() as patch:  # undone the other way round
         if sys.platform == "linux":
             _impose_windows(patch)
         elif os.name != "nt":

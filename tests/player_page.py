@@ -111,6 +111,16 @@ def open_player(page: Page, address: Path) -> None:
     settle(page)
 
 
+def press_button(page: Page, selector: str) -> None:
+    """Click a button of the player; one that is folded away, as in these low windows, is unfolded before."""
+    folded = page.evaluate("document.body.classList.contains('folded')")
+    if folded:
+        page.press("c")
+    page.click(selector)
+    if folded:
+        page.press("c")
+
+
 @contextmanager
 def with_script(page: Page, code: str) -> Iterator[None]:
     """Run JavaScript before the scripts of each page that is loaded meanwhile."""

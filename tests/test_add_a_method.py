@@ -2,7 +2,10 @@
 
 import json
 import re
+import shutil
 import signal
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +22,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import OWN, Config
 from endoprior.core.config_io import to_dict
 from endoprior.data import load_sequence
+from endoprior.evaluation.registry import all_scores
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.method import METHODS, config_from, method_named, method_of
 from endoprior.model.presets import preset, preset_names
@@ -48,6 +52,42 @@ def registered(site: Path, change: tuple[str, str] = ("", "")) -> Iterator[None]
     write_package(site, "of-the-page", named, **code)
     with on_path(site):
         yield
+
+
+def test_the_package_of_the_page_installs_as_the_page_says(tmp_path):
+    text = PAGE.read_text(encoding="utf-8")
+    (project,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    (copied,) = re.findall(r"^cp (.*) own/$", text, re.MULTILINE)
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "pyproject.toml").write_text(project, encoding="utf-8")
+    for file in copied.split():
+        shutil.copy(PAGE.parents[1] / file, own)
+    offline = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
+    words = [sys.executable, "-m", "pip", "install", *offline, "--target", str(tmp_path / "site"), str(own)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with on_path(tmp_path / "site"):
+        assert {"linear", "own-loss"} <= {*preset_names()} and "area_error" in all_scores()
+        assert preset("own-loss").method == "own-loss" and method_named("linear").motion is not None
+
+
+def test_a_benchmark_says_that_the_package_of_a_method_is_missing(tmp_path, capsys):
+    plugin = "nstall the package with this plugin; `endoprior plugins` lists what is installed."
+    assert main(["bench", str(BENCH), str(tmp_path / "out")]) == 2
+    text = capsys.readouterr().err
+    assert "methods.own-loss.preset: expected one of default, " in text
+    assert f"got 'own-loss', which no installed package has. Fix: I{plugin}" in text
+    spec = yaml.safe_load(BENCH.read_text(encoding="utf-8"))
+    spec |= {"methods": {"default": {"preset": "defualt"}}, "claims": []}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
+    assert main(["bench", str(tmp_path / "spec.yaml"), str(tmp_path / "out")]) == 2
+    assert f"Fix: I{plugin} Did you mean `default`?" in capsys.readouterr().err
+    spec["methods"]["default"]["preset"] = "default"
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
+    assert main(["bench", str(tmp_path / "spec.yaml"), str(tmp_path / "out")]) == 2
+    text = capsys.readouterr().err
+    assert "got 'area_error'. Fix: See docs/scores.md, or i" in text and plugin in text
 
 
 @pytest.fixture

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import ast
+import doctest
+import inspect
 import itertools
 import re
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import torch
 
 import endoprior
+from endoprior.core.types import RenderedView
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(endoprior.__file__).parent
+CALLABLE = {"export": "export", "phantom": "write_phantom", "prepare": "prepare"}
+"""Packages with a public name -> their function."""
 SHORT = """
 import endoprior
 full = endoprior.preset
@@ -46,14 +53,71 @@ def test_no_import_replaces_a_public_name():
     subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True)
 
 
+FUNCTIONS = {name for name in endoprior.__all__ if not inspect.isclass(getattr(endoprior, name))}
+CHAIN = ("phantom", "train")
+"""Functions whose examples write what the others open, DATA and RUN."""
+
+
+@pytest.fixture(scope="module")
+def examples_folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("examples")
+
+
+@pytest.mark.parametrize("name", [*CHAIN, *sorted(FUNCTIONS - {*CHAIN})])
+def test_the_example_of_a_public_function_runs(name, examples_folder, monkeypatch, capsys):
+    monkeypatch.chdir(examples_folder)
+    function = getattr(endoprior, name)
+    (example,) = doctest.DocTestFinder(recurse=False).find(inspect.unwrap(function), name, globs={})
+    assert example.examples, f"{name} has no example"
+    result = doctest.DocTestRunner().run(example)
+    assert not result.failed, capsys.readouterr().out
+
+
+def test_a_sequence_is_indexed_iterated_and_printed(tiny_sequence):
+    sequence = endoprior.load_sequence(tiny_sequence)
+    assert [frame.index for frame in sequence] == list(range(len(sequence)))
+    assert sequence[0] is sequence.frame(0) and sequence[-1].index == len(sequence) - 1
+    assert [frame.index for frame in sequence[1:7:3]] == [1, 4]
+    with pytest.raises(IndexError):
+        sequence[len(sequence)]
+    assert re.fullmatch(r"FrameSequence\('.*': \d+ frames \(.* test\), 48x40, 15 .*, depth in mm\)", repr(sequence))
+    part = repr(sequence.part(0, 2))
+    assert "2 frames (1 train, 1 test)" in part and "\n" not in part
+
+
+def test_expected_depth_is_divided_by_alpha():
+    depth, alpha = torch.tensor([[20.0, 0.0]]), torch.tensor([[0.5, 0.0]])
+    assert RenderedView(torch.zeros(1, 2, 3), depth, alpha).expected_depth.tolist() == [[40.0, 0.0]]
+
+
 def test_no_module_below_the_package_has_a_public_name():
     modules = {path.stem for path in PACKAGE.iterdir()}
-    assert not modules & set(endoprior.__all__)
+    assert modules & set(endoprior.__all__) == set(CALLABLE)
+
+
+@pytest.mark.parametrize(("name", "function"), CALLABLE.items())
+@pytest.mark.parametrize("first", ["", "import endoprior.{}; ", "from endoprior.{} import {}; "])
+def test_a_package_with_a_public_name_can_be_called(name, function, first):
+    code = (
+        f"import endoprior, inspect; {first.format(name, function)}"
+        f"assert inspect.ismodule(endoprior.{name}) and endoprior.{name}.__call__ is endoprior.{name}.{function};"
+        f"assert inspect.signature(endoprior.{name}) == inspect.signature(endoprior.{name}.{function})"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_version_is_that_of_the_installation():
+    assert endoprior.__version__ == version("endoprior")
 
 
 def test_public_names_are_typed_and_listed_once():
     assert (PACKAGE / "py.typed").is_file()
     tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
     (guarded,) = (node for node in tree.body if isinstance(node, ast.If))
-    typed = {alias.name: node.module for node in guarded.body for alias in node.names}
+    typed = {
+        alias.asname or alias.name: node.module
+        for node in guarded.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
     assert typed == endoprior.HOMES and sorted(typed) == endoprior.__all__ == dir(endoprior)

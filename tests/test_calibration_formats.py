@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
+from endoprior.data.lens import MODELS, UNSUPPORTED, Lens
 from endoprior.prepare.calibration import check_pair
 from endoprior.prepare.calibration_files import read_calibration
 
@@ -40,11 +41,11 @@ def matrix_yaml(name, values):
     )
 
 
-def kalibr():
+def kalibr(model="pinhole", numbers=()):
     text = ""
     for i, (k, d) in enumerate(((K1, D1), (K2, D2))):
-        text += f"cam{i}:\n  cam_overlaps: [{1 - i}]\n  camera_model: pinhole\n  distortion_coeffs: {rows(d)}\n"
-        text += f"  distortion_model: radtan\n  intrinsics: {rows([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])}\n"
+        text += f"cam{i}:\n  cam_overlaps: [{1 - i}]\n  camera_model: {model}\n  distortion_coeffs: {rows(d)}\n"
+        text += f"  distortion_model: radtan\n  intrinsics: {rows([*numbers, k[0, 0], k[1, 1], k[0, 2], k[1, 2]])}\n"
         text += f"  resolution: [640, 512]\n  rostopic: /cam{i}/image_raw\n"
         if i:
             text += "  T_cn_cnm1:\n" + "".join(f"  - {rows(row)}\n" for row in to_right())
@@ -191,6 +192,18 @@ def test_single_cameras_of_other_programs(tmp_path, form):
     assert any("no lens distortion is stated" in note for note in found.notes) == (len(distortion) == 0)
 
 
+@pytest.mark.parametrize("model", sorted({*MODELS} - {*UNSUPPORTED}))
+def test_every_model_of_colmap(tmp_path, model):
+    names = MODELS[model].split()
+    numbers = {name: 580.0 + i if i < 2 and name[0] == "f" else 318.2 if name[0] == "c" else 0.01 * i
+               for i, name in enumerate(names)}  # fmt: skip
+    text = "# Camera list with one line of data per camera:\n" + colmap(model, " ".join(map(str, numbers.values())))
+    (tmp_path / "cameras.txt").write_text(text)
+    found, lens = read_calibration(tmp_path / "cameras.txt").left, Lens.of(model, 640, 512, numbers)
+    assert np.allclose(found.matrix, lens.matrix) and found.fisheye == model.endswith("FISHEYE")
+    assert np.allclose(np.pad(found.distortion, (0, len(lens.distortion) - len(found.distortion))), lens.distortion)
+
+
 def test_colmap_binary(tmp_path):
     values = (580, 582, 318.7, 255.6, *D1)
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ8d", 1, 1, 4, 640, 512, *values))
@@ -232,7 +245,10 @@ def in_json(**items):
 
 
 REJECTED = {
-    "omni": ("c.yaml", kalibr().replace("pinhole", "omni"), "got omni"),
+    "omni": ("c.yaml", kalibr("omni"), "got omni"),
+    "omni of Kalibr": ("c.yaml", kalibr("omni", [1.2]), "got omni"),
+    "ds of Kalibr": ("c.yaml", kalibr("ds", [-0.2, 0.5]), "got ds"),
+    "MEI": ("c.yaml", "%YAML:1.0\nmodel_type: MEI\nmirror_parameters:\n   xi: 1.2\n", "got MEI"),
     "fov": ("cameras.txt", colmap("FOV", "1 2 3 4 5"), "got FOV"),
     "an unknown model": ("c.json", in_json(distortion_model="division2", D=[0.1] * 4), "got division2"),
     "which of two models": ("c.json", in_json(k1=1, k2=1, k3=1, k4=1), "the model of the distortion"),
@@ -240,6 +256,8 @@ REJECTED = {
     "MATLAB": ("c.mat", b"MATLAB 5.0 MAT-file, Platform", "a .mat file of MATLAB"),
     "HDF5": ("c.mat", b"\x89HDF\r\n\x1a\n", "HDF5"),
     "pickle": ("c.pkl", b"\x80\x04\x95", "a pickle, which could run programs"),
+    "COLMAP without a number": ("cameras.txt", colmap("SIMPLE_RADIAL", "nan 320 256 0"), "fx to be a number, got nan"),
+    "COLMAP with a word": ("cameras.txt", colmap("SIMPLE_RADIAL", "f 320 256 0"), "rows `CAMERA_ID MODEL WIDTH"),
     "COLMAP cut": ("cameras.bin", b"\x01" + bytes(30), "a .bin file that ends too early"),
     "Metashape": ("c.xml", "<?xml version='1.0'?><calibration><f>1</f></calibration>", "got <calibration>"),
     "entities": ("c.xml", "<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage/>", "a document type"),

@@ -10,12 +10,13 @@ import torch
 from export_scenes import moving_scene
 from hexplane_grids import planes
 
-from endoprior.model.carry import NUM_CARRIERS, carry, carry_points, confidence_of
+from endoprior.model.carry import NUM_CARRIERS, carry, carry_points
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface import project_visible, render_surface, shown_pixels
+from endoprior.model.uncertainty import point_errors
 
 TIMES = [i / 10 for i in range(10)]
 
@@ -27,6 +28,10 @@ def still_scene():
         scene.gaussians["motion"].zero_()
         scene.gaussians["frame_motion"].zero_()
     return scene
+
+
+def confidence(scene, points, frames, times=TIMES):
+    return point_errors(scene, carry(scene, points, frames, times), frames, range(len(times))).confidence
 
 
 def test_a_point_moves_by_the_weighted_mean_of_its_carriers():
@@ -45,39 +50,32 @@ def test_a_point_moves_by_the_weighted_mean_of_its_carriers():
 
 def test_confidence_falls_with_the_disagreement_of_the_carriers():
     scene, point = still_scene(), np.array([[0.5, 0.5, 60.1]])
-    agreed = carry(scene, point, np.array([0]), TIMES).confidence
+    agreed = confidence(scene, point, np.array([0]))
     with torch.no_grad():
         scene.gaussians["motion"][:, :, 0] = 2.0
-    assert carry(scene, point, np.array([0]), TIMES).confidence == pytest.approx(agreed, abs=1e-4), "they move together"
+    together = confidence(scene, point, np.array([0]))
+    assert together[0] == 1 and (together > 0.95).all(), "they move together"
     with torch.no_grad():  # every second Gaussian goes the other way in the later half
         half = scene.gaussians["motion"].shape[1] // 2
         scene.gaussians["motion"][::2, half:, 0] = -2.0
-    torn = carry(scene, point, np.array([0]), TIMES).confidence
-    assert torn[0] == agreed[0] and (torn[7:] < 0.3).all() and (torn[7:] < torn[2:4].min()).all()
-    later = carry(scene, point, np.array([8]), TIMES).confidence
-    assert later[8] == agreed[0] and later[0] < 0.3, "backward in time too"
+    torn = confidence(scene, point, np.array([0]))
+    assert torn[0] == agreed[0] == 1 and (torn[7:] < 0.3).all() and (torn[7:] < torn[2:4].min()).all()
+    later = confidence(scene, point, np.array([8]))
+    assert later[8] == 1 and later[0] < 0.3, "backward in time too"
 
 
 def test_confidence_is_counted_in_the_image():
     scene, point = moving_scene(), np.array([[0.5, 0.5, 60.1]])
-    near = carry(scene, point, np.array([0]), TIMES).confidence[5:]
+    near = confidence(scene, point, np.array([0]))[5:]
     away = np.eye(4)
     away[2, 3] = 600
     far = replace(scene, cameras=tuple(replace(camera, world_to_camera=away) for camera in scene.cameras))
     behind = replace(scene, cameras=tuple(replace(camera, world_to_camera=-away) for camera in scene.cameras))
-    assert (carry(far, point, np.array([0]), TIMES).confidence[5:] > near).all()
-    assert (carry(behind, point, np.array([0]), TIMES).confidence == 0).all()
+    assert (confidence(far, point, np.array([0]))[5:] > near).all()
+    assert (confidence(behind, point, np.array([0]))[1:] == 0).all()
     larger = tuple(replace(c, width=128, height=96, fx=160.0, fy=160.0, cx=60.0, cy=52.0) for c in scene.cameras)
-    same = carry(replace(scene, cameras=larger), point, np.array([0]), TIMES).confidence[5:]
+    same = confidence(replace(scene, cameras=larger), point, np.array([0]))[5:]
     assert same == pytest.approx(near, rel=1e-5), "px of an image 640 px wide"
-
-
-def test_confidence_is_a_probability_that_never_rises_with_the_spread():
-    spread = np.array([0, 1, 3, 10, 100, np.inf])
-    values = confidence_of(spread)
-    assert (np.diff(values) < 0).all() and 0.98 < values[0] < 1 and values[-1] == 0
-    error = np.random.default_rng(0).normal(size=(2, 100_000)) * np.hypot(1.3, 0.65 * 3)
-    assert values[2] == pytest.approx((np.hypot(*error) < 4).mean(), abs=0.01)
 
 
 def test_few_points_need_few_gaussians(monkeypatch):

@@ -53,6 +53,23 @@ def data(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "data", ignore=shutil.ignore_patterns("right")))
 
 
+def test_overexposed_tissue_is_named_with_its_share_and_frames(data, facts):
+    assert "overexposed" not in {finding.code for finding in find(facts)}
+
+    def whiten(image, position):
+        if position in (2, 3):
+            image[60:130, 60:190] = 255
+        return image
+
+    edit(data / "images", whiten)
+    sequence = load_sequence(data)
+    found = {finding.code: finding for finding in find(measure(sequence))}["overexposed"]
+    tissue = [sequence.frame(i).tissue_mask for i in (2, 3)]
+    share = np.mean([mask[60:130, 60:190].sum() / mask.sum() for mask in tissue])
+    assert (found.severity, found.frames) == ("warning", (2, 3))
+    assert found.what == f"{share:.0%} of the tissue is overexposed, in frames 2-3: its color is a guess"
+
+
 @pytest.mark.slow
 def test_frames_of_uncertain_masks_are_named_and_shown(data, tmp_path, monkeypatch):
     confidence = [0.9, 0.4, 0.8, 0.3] + [0.45 + 0.001 * i for i in range(5)] + [0.9] * 3

@@ -83,6 +83,12 @@ def test_train_scores_and_reports_skipped_scores(run):
     assert metrics["scores"]["psnr_tissue"] == pytest.approx(np.mean([row["psnr_tissue"] for row in per_frame]))
 
 
+def test_train_ends_with_what_to_type_next(tiny_sequence, tmp_path, capsys):
+    words = ["--iterations", "2", "--gaussians", "200", "--no-networks"]
+    assert main(["train", str(tiny_sequence), str(tmp_path / "r"), *words]) == 0
+    assert capsys.readouterr().out.endswith(f"To turn and measure it: `endoprior view {tmp_path / 'r'}`\n")
+
+
 def test_eval_repeats_the_scores_of_train(run, tmp_path):
     _, folder = run
     assert main(["eval", str(folder), "--out", str(tmp_path), "--no-networks"]) == 0

@@ -9,16 +9,14 @@ from pathlib import Path
 import pytest
 
 from endoprior.cli.train import Train
-from endoprior.core import config_io, former_config
+from endoprior.core import config_io
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.model.gaussians import temporal_shapes
-from endoprior.model.method import config_from, method_of
+from endoprior.model.method import method_of
 from endoprior.model.presets import preset, preset_names
-from endoprior.model.scene_file import SceneFacts
-from endoprior.runs.folder import reject_other_run
 from endoprior.training.gaussian_trainer import spatial_scale
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
@@ -223,106 +221,9 @@ def leaves(values, prefix=""):
             yield f"{prefix}{name}", value
 
 
-FORMER = json.loads((Path(__file__).parent / "former_configs.json").read_text())
-"""What the version before stored of each preset: 141 fields, as nested dicts, only where they differ from `paper`."""
-SCHEDULE = (
-    "schedule.fine_iterations", "optim.decay_iterations", "schedule.half_resolution_iterations",
-    "density.start_iteration", "temporal.start_iteration",
-)  # fmt: skip
-FORMER_SCHEDULES = {
-    "default": (1500, 1500, 500, 500, 500),
-    "best": (3000, 3000, 800, 500, 500),
-    "preview": (500, 500, 170, 170, 170),
-}
-FORMER_RATES = {"optim.means_lr": 5e-3, "optim.basis_lr": 0.01, "optim.scales_lr": 0.02, "optim.quats_lr": 0.01}
-
-
-def former(name: str) -> dict:
-    """A stored config with all fields of the version before."""
-    merged = dict(leaves(FORMER["paper"])) | dict(leaves(FORMER[name]))
-    values: dict = {}
-    for field, value in merged.items():
-        *path, last = field.split(".")
-        functools.reduce(lambda group, part: group.setdefault(part, {}), path, values)[last] = value
-    return values
-
-
-@pytest.fixture
-def told(capsys):
-    """What was said about a stored config, each line once."""
-    former_config.print_once.cache_clear()
-    return lambda: capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", sorted(FORMER))
-def test_what_the_version_before_stored_is_the_preset_of_today(name, told):
-    stored = former(name)
-    assert len(dict(leaves(stored))) == 141
-    since = {"endogaussian": {"init.budget": 20_000}, "endo4dgs": {"render.depth_grad_to_means": False}}
-    if name in FORMER_SCHEDULES:
-        since[name] = FORMER_RATES | dict(zip(SCHEDULE, FORMER_SCHEDULES[name], strict=True))
-    former_values = {"render.photometric": "none"} | since.get(name, {})
-    assert config_from(stored) == config_from(stored) == preset(name, **former_values)
-    assert told() == (
-        "endoprior: stored config: 80 of its fields are constants of this version, with the same values\n"
-    )
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"density.split_shrink": 2.0}, "density.split_shrink is 1.6 here and 2.0 there"),
-        ({"optim.means_lr": 1e-2}, "optim.means_lr_final is 0.0001 here and 5e-05 there"),
-        ({"temporal.pair_weights": False}, None),
-        ({"temporal.distance_weight": 0.0}, None),
-        ({"temporal.refill": True}, "temporal.refill is False here and True there"),
-        ({"deformation.deform_quats": False}, "deformation.deform_quats is True here and False there"),
-        ({"deformation.hexplane.width": 64}, None),  # which this preset does not have
-        ({"windows.shortest": 30}, "windows.shortest is 40 here and 30 there"),
-        ({"windows.enabled": False}, None),
-    ],
-)
-def test_a_stored_number_that_is_another_one_now_is_said(changes, says, told):
-    stored = former("default")
-    for name, value in changes.items():
-        *path, last = name.split(".")
-        functools.reduce(dict.__getitem__, path, stored)[last] = value
-    config_from(stored)
-    line = told()
-    assert line.count("\n") == 1
-    assert f"{says}: a run with it does not resume bit-identically\n" in line if says else "with the same" in line
-
-
-@pytest.mark.parametrize("name", ["relative_width", "frames_per_basis"])
-def test_a_scene_that_could_not_be_rendered_as_it_was_is_rejected(name, told):
-    stored = former("default")
-    stored["deformation"]["basis"][name] = 2.0
-    if name == "relative_width":
-        with pytest.raises(InputError, match=r"relative_width: expected 1\.5, got 2\.0\. Fix: Render this scene with"):
-            config_from(stored)
-    else:
-        config_from(stored)
-
-
-def test_what_nothing_is_left_of_is_ignored_and_named_once(told):
-    now = Config(seed=3)
-    stored = to_dict(now)
-    stored["poses"], stored["loss"]["fit_relative_depth"] = {"refine": "always"}, True
-    assert from_dict(Config, stored) == now
-    about = {"config": stored, "width": 9, "height": 9, "frames_per_second": 25.0}
-    assert from_dict(SceneFacts, about, "about").config == now
-    reject_other_run(Path("f"), stored, "data", now, "data", Path())
-    line = "endoprior: stored config: ignored poses, loss.fit_relative_depth, which this version does not have\n"
-    assert told() == line
-
-
-@pytest.mark.parametrize("name", ["poses.refine", "loss.fit_relative_depth", "density.split_shrink"])
-def test_a_former_field_cannot_be_set(name):
-    with pytest.raises(InputError, match=f"got {name}"):
-        Config().replace({name: True})
-
-
 @pytest.mark.parametrize("stored", [{"pose": {}}, {"loss": {"fit_depth": True}}, {"of_stored": []}])
-def test_other_unknown_fields_of_a_stored_config_are_errors(stored):
-    with pytest.raises(InputError, match="no such field"):
+def test_unknown_fields_of_a_stored_config_are_errors(stored):
+    with pytest.raises(
+        InputError, match=r"no such field\. Fix: Correct the name, or use the version of endoprior that"
+    ):
         from_dict(Config, stored)

@@ -16,7 +16,7 @@ from endoprior.training.adam import adam_step_numba as adam_step
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 from endoprior_baselines.deform3dgs import METHOD, first_points
 from endoprior_baselines.learned_basis import COEFFICIENTS, value_at

@@ -126,6 +126,13 @@ FILLED = {
     "largest.npy": hole(np.float64, np.finfo(np.float64).max),
     "infinite.npy": hole(np.float32, np.inf),
     "float.tiff": hole(np.float32, 1000),
+    # Less than 1.5 times as far as the tissue, 70 to 80:
+    "8-bit near.png": hole(np.uint8, 91),
+    "10-bit.png": hole(np.uint16, 1023, 800),
+    "12-bit.png": hole(np.uint16, 4095, 2800),
+    "14-bit.npy": hole(np.int32, 16383, 15000),
+    "last but one.png": hole(np.uint16, 65534, 58000),
+    "float near.npy": hole(np.float32, 100.0),
 }
 
 
@@ -154,6 +161,8 @@ def test_two_fillings_and_single_errors_are_missing(tmp_path):
         np.full((8, 8), 255, np.uint8),  # a wall
         np.tile(np.arange(10, 255, 5, dtype=np.uint8), (9, 1)),  # a deep view, 25 times as far at its end
         np.tile(np.array([60, 62, 85], np.uint16), (9, 3)),
+        np.minimum(hole(np.uint16, 740, 700), 706),  # clipped: its end is flat, without an edge
+        np.where(np.arange(40) < 18, hole(np.uint8, 70, 40), 95).astype(np.uint8),  # a wall behind a tool
     ],
 )
 def test_measured_depth_is_kept(tmp_path, stored):
@@ -193,7 +202,7 @@ def checked(folder, capsys):
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("filling", "unit"), [(65535, 0.1), (1e6, 1.0)])
+@pytest.mark.parametrize(("filling", "unit"), [(65535, 0.1), (1e6, 1.0), (1023, 0.1), (98.0, 1.0)])
 def test_prepare_leaves_holes_empty_and_says_so(tmp_path, capsys, filling, unit):
     images(tmp_path)
     (tmp_path / "depth").mkdir()
@@ -205,7 +214,7 @@ def test_prepare_leaves_holes_empty_and_says_so(tmp_path, capsys, filling, unit)
         else:
             np.save(tmp_path / f"depth/{i}.npy", depth)
     said = prepare(tmp_path, capsys, "--depth", str(tmp_path / "depth"), "--depth-unit-mm", str(unit))
-    assert f"note: depth: numbers from {filling:g} on are far above the rest and count as missing, 9.8% of it" in said
+    assert f"note: depth: numbers from {filling:g} on count as missing, 9.8% of it: they are far above the rest" in said
     for i in (0, 11):
         stored = cv2.imread(str(tmp_path / f"out/depth/{i:06d}.png"), cv2.IMREAD_UNCHANGED) * 0.01
         assert not stored[5:20, 5:25].any()
@@ -261,3 +270,10 @@ def test_a_folder_prepared_without_depth_opens_and_check_says_how_to_add_it(tmp_
     assert sequence.camera(0).fx == pytest.approx(32 / np.tan(np.radians(35)))
     said = checked(tmp_path / "out", capsys)
     assert "error: no-depth-frames: no frame has depth. Fix: run `prepare` without `--depth`" in said
+
+
+@pytest.mark.slow
+def test_the_depth_of_the_real_clip_is_kept(real_clip):
+    for path in sorted((real_clip / "depth").iterdir())[::15]:
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # clipped to 129.37 mm
+        np.testing.assert_array_equal(read_depth_file(path) > 0, stored > 0)

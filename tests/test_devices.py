@@ -97,7 +97,7 @@ def test_gsplat_compiles_where_no_gpu_is(monkeypatch):
         ("exit 1", False, "no answer"),
         ("kill -SEGV $$", False, "ended by signal 11"),
         ("sleep 60 & wait", False, "no answer in 0.5 s"),
-        ('echo "$*"', True, "-P -m endoprior.render.trial triton"),
+        ('echo "$*"', True, "-P -m endoprior.system.run_module endoprior.render.trial triton"),
     ],
 )
 def test_a_trial_may_fail_in_any_way(python, monkeypatch, body, works, found):

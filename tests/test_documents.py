@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+import subprocess
+import sys
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -105,6 +107,14 @@ def test_python_and_yaml_parse(page):
             yaml.safe_load(token.content)
 
 
+@pytest.mark.slow
+def test_the_types_of_python_examples_fit():
+    done = subprocess.run([sys.executable, ROOT / "tools" / "check_examples.py"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    pages = {path.name.partition("_line_")[0] for path in (ROOT / "build" / "examples").iterdir()}
+    assert pages >= {"README", "export"}
+
+
 def test_there_is_something_to_check():
     """The patterns above match: a page that shows every kind."""
     assert ["train", "DATA", "RUN"] in commands(ROOT / "README.md") and "your-own-video" in anchors(ROOT / "README.md")
@@ -113,7 +123,7 @@ def test_there_is_something_to_check():
 
 def test_page_of_check_names_every_problem():
     lines = re.findall(r"^- (`.*?) \(", (ROOT / "docs" / "check.md").read_text(), re.MULTILINE)
-    source = (ROOT / "src" / "endoprior" / "check" / "findings.py").read_text()
+    source = "".join(file.read_text() for file in (ROOT / "src" / "endoprior" / "check").glob("*.py"))
     codes = set(re.findall(r"`([a-z0-9-]+)`", " ".join(lines)))
     assert codes and all(f'"{code}"' in source for code in codes)
     assert codes >= set(re.findall(r'Finding\("([a-z0-9-]+)"', source))

@@ -18,7 +18,7 @@ from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 from endoprior_baselines.endo4dgs import (
     METHOD,

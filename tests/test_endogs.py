@@ -20,7 +20,7 @@ from endoprior.training.frames import TrainingFrames
 from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 from endoprior_baselines.endogs import METHOD, JointField, depth_huber
 from endoprior_baselines.plane_terms import PlaneWeights, plane_term

@@ -2,6 +2,8 @@
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from endoprior.cli import main
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks
 from endoprior.evaluation.context import Evaluation
+from endoprior.evaluation.networks import WeightsMissing
 from endoprior.evaluation.scorers.tracks import by_scene, parts_of, track_end_error_mm, track_scores, true_tracks
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.carry import carry_points
@@ -35,6 +38,23 @@ def still_scene(sequence, budget=400):
     trainer = GaussianTrainer(sequence, cfg)
     trainer.start()
     return trainer.scene()
+
+
+@pytest.mark.skipif(find_spec("lpips") is None, reason="network scores need the packages torchvision and lpips")
+@pytest.mark.parametrize("asked", [False, True])
+def test_weights_are_downloaded_only_if_asked(phantom, monkeypatch, asked):
+    sought = {}
+
+    def none(files, _weights_dir=None, *, download=True):
+        sought[files.network] = download
+        raise WeightsMissing("none")
+
+    for scorer in ("lpips", "motion"):
+        monkeypatch.setattr(f"endoprior.evaluation.scorers.{scorer}.find_weights", none)
+    monkeypatch.setattr("endoprior.evaluation.scorers.motion.import_torchvision", MagicMock)
+    result = evaluate(still_scene(phantom), phantom, speed=False, **({"download": True} if asked else {}))
+    assert {"lpips", "flow_error"} <= result.skipped.keys()
+    assert sought == {"AlexNet": asked, "SqueezeNet 1.1": False, "RAFT-large": asked, "RAFT-small": False}
 
 
 def test_carried_points_follow_a_common_motion(phantom):

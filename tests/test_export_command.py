@@ -15,10 +15,21 @@ from export_scenes import export, moving_run, moving_scene
 from plyfile import PlyData
 
 from endoprior.cli import main
+from endoprior.core.types import Splats
 from endoprior.export.formats import FORMATS, formats_of, load_format
 from endoprior.export.frames import depth_png
+from endoprior.model.gaussians import Gaussians
 from endoprior.model.scene_file import load_scene
+from endoprior.render import load as rasterizer
 from endoprior.render import sh
+
+PLY_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+    "log_scales": ("scale_0", "scale_1", "scale_2"),
+    "dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "rest": tuple(f"f_rest_{i}" for i in range(9)),
+}
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +186,7 @@ def test_every_suffix_has_a_format_and_ambiguous_ones_the_first():
 def test_a_name_without_a_known_suffix_lists_the_formats(run, tmp_path, capsys, name):
     assert main(["export", str(run), str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
-    assert ".ply .sog .splat .spz .glb .obj .stl .mrb .json " in error
+    assert ".ply .sog .splat .spz .glb .obj .stl .usdz .usdc .mrb .json " in error
     assert ", ".join(FORMATS) in error and error.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
@@ -201,6 +212,59 @@ def test_the_command_says_what_it_wrote(run, tmp_path, capsys, name, options, wo
     said = capsys.readouterr().out
     assert f"{out}: {words.format(count=count)}\n" in said
     assert ("one color for each Gaussian" in said) == ("Gaussians" in words)  # their colors have slopes
+
+
+def said_psnr(text: str) -> float:
+    return float(re.search(r"with a PSNR of ([\d.]+) dB", text)[1])
+
+
+@pytest.mark.parametrize("axes", ["opencv", "ras"])
+def test_the_loss_is_that_of_the_file(run, tmp_path, capsys, axes):
+    """Of what plyfile reads, rendered by the reference."""
+    scene = load_scene(run)
+    assert export(run, tmp_path / "a.ply", "ply", "--times", "0.5", "--frame", axes) == 0
+    psnr = said_psnr(capsys.readouterr().out)
+    if axes == "opencv":
+        vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+        read = {k: np.stack([vertex[name] for name in names], 1) for k, names in PLY_COLUMNS.items()}
+        rest = read["rest"].reshape(len(vertex), 3, 3).transpose(0, 2, 1)
+        tensors = {
+            "means": read["means"],
+            "quats": read["quats"],
+            "scales": np.exp(read["log_scales"]),
+            "opacities": 1 / (1 + np.exp(-vertex["opacity"])),
+            "sh": np.concatenate([read["dc"][:, None], rest], 1),
+        }
+        splats = Splats(**{name: torch.tensor(value) for name, value in tensors.items()})
+        image = rasterizer("reference")(splats, scene.camera_at(0.5), background=torch.zeros(3)).color.clamp(0, 1)
+        want = -10 * float(torch.log10(((image - scene.render(0.5).color) ** 2).mean()))
+        assert psnr == pytest.approx(want, abs=0.051)
+    assert export(run, tmp_path / "b.ply", "ply", "--times", "0.5") == 0
+    assert psnr == pytest.approx(said_psnr(capsys.readouterr().out), abs=0.051)
+
+
+def test_a_format_that_keeps_less_loses_more(run, tmp_path, capsys):
+    found = []
+    for name, file in (("ply", "a.ply"), ("splat", "a.splat")):  # .splat has no direction-dependent color
+        assert export(run, tmp_path / file, name, "--times", "0.5") == 0
+        found.append(said_psnr(capsys.readouterr().out))
+    assert found[0] > found[1] + 3
+    assert export(run, tmp_path / "folder", "ply") == 0
+    assert "note: the file shows 3 images of the scene with a PSNR of" in capsys.readouterr().out
+    assert export(run, tmp_path / "a.obj", "mesh", "--times", "0.5") == 0
+    assert "PSNR" not in capsys.readouterr().out
+
+
+def test_a_file_that_keeps_all_says_so(tmp_path, capsys):
+    scene = moving_scene()
+    with torch.no_grad():
+        scene.gaussians["color_slopes"].zero_()
+        scene.gaussians["changes"].zero_()
+    cfg = replace(scene.config, render=replace(scene.config.render, color_slopes=False))
+    tensors = {name: value for name, value in scene.gaussians.tensors.items() if name != "color_slopes"}
+    replace(scene, config=cfg, gaussians=Gaussians(tensors)).save(tmp_path / "run/scene.safetensors")
+    assert export(tmp_path / "run", tmp_path / "a.ply", "ply", "--times", "0.5") == 0
+    assert "with a PSNR of over 60 dB, no visible difference.\n" in capsys.readouterr().out
 
 
 def test_an_existing_file_is_kept_unless_it_may_be_overwritten(run, tmp_path, capsys):

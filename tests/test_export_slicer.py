@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -128,8 +129,9 @@ def test_points_play_with_the_mesh_where_tracks_has_them(run, tmp_path):
         positions, points = inside.markups(inside.nodes[identity])
         assert positions == pytest.approx(found["points"][frame], abs=1e-4)
         assert [p["label"] for p in points] == ["0", "1", "2"]
-        confidence = [float(p["description"].removeprefix("confidence ")) for p in points]
-        assert confidence == pytest.approx(found["confidence"][frame], abs=0.02)
+        numbers = [[float(n) for n in re.findall(r"[0-9.]+(?=[; ])", p["description"])] for p in points]
+        wanted = np.stack([found[name][frame] for name in ("confidence", "across95", "along95")], 1)
+        assert np.array(numbers) == pytest.approx(wanted, abs=0.02)
 
 
 def test_vtk_reads_color_and_axes(bundle, meshes, tmp_path):

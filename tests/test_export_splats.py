@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Splats
+from endoprior.export.formats import load_format
 from endoprior.export.gltf import encode_glb
 from endoprior.export.packed_splats import encode_compressed_ply, encode_sog, encode_splat, encode_spz
 from endoprior.export.ply import encode_ply
@@ -203,3 +204,37 @@ def test_glb_follows_the_ratified_extension(degree, tmp_path):
     back = np.where(back <= 0.0031308, 12.92 * back, 1.055 * back ** (1 / 2.4) - 0.055)
     assert back == pytest.approx(encoded, abs=1e-5)
     assert np.array_equal(arrays["COLOR_0"][:, 3], splats.opacities.numpy())
+
+
+ROUNDED = {  # largest error of position (mm), scale (share), opacity and color of each format
+    "ply": (encode_ply, 0, 1e-6, 1e-6, 0),
+    "gltf": (lambda splats: encode_glb(splats, {}), 0, 0, 0, 0),
+    "splat": (encode_splat, 0, 0, 0.002, 0.007),
+    "spz": (encode_spz, 2e-4, 0.032, 0.002, 0.014),
+    "sog": (encode_sog, 0.01, 0.01, 0.002, 0.004),
+    "compressed_ply": (encode_compressed_ply, 0.05, 0.003, 0.002, 0.016),
+}
+
+
+@pytest.mark.parametrize("name", ROUNDED)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_our_reader_gives_what_was_written(name, degree):
+    encode, *limits = ROUNDED[name]
+    splats = random_splats(300, degree)
+    found = load_format(name).read(encode(splats))
+    own = (
+        ((splats.means[:, None] - found.means[None]) ** 2).sum(-1).argmin(1)
+    )  # some formats have an order of their own
+    assert sorted(own.tolist()) == list(range(300))
+    kept = found.sh.shape[1]
+    assert kept == (1 if name in ("splat", "sog") else (degree + 1) ** 2)
+    errors = [
+        (found.means[own] - splats.means).abs().max(),
+        (found.scales[own] / splats.scales - 1).abs().max(),
+        (found.opacities[own] - splats.opacities).abs().max(),
+        (found.sh[own] - splats.sh[:, :kept]).abs().max(),
+    ]
+    assert all(error <= limit for error, limit in zip(errors, limits, strict=True)), errors
+    long = np.tile([3.0, 2.0, 1.0], (300, 1))
+    turned = covariances(found.quats[own].numpy(), long), covariances(splats.quats.numpy(), long)
+    assert np.abs(turned[0] - turned[1]).max() < 0.15

@@ -51,15 +51,14 @@ def test_tracks_of_query_points(run, tmp_path):
         pixels, _ = project(world[i], scene.cameras[i])
         assert found["pixels"][i] == pytest.approx(pixels, abs=1e-2)
     rows = read_tracks(tmp_path / "out" / "tracks.csv")
-    assert (
-        list(rows[0]) == ["frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence"]
-        and len(rows) == 20
-    )
+    columns = "frame time point x y z u v visible confidence across95 along95"
+    assert list(rows[0]) == columns.split() and len(rows) == 20
     for row in rows:
         i, p = int(row["frame"]), int(row["point"])
         assert [float(row[c]) for c in "xyz"] == pytest.approx(found["points"][i, p], abs=1e-3)
         assert float(row["u"]) == pytest.approx(found["pixels"][i, p, 0], abs=1e-3)
-        assert float(row["confidence"]) == pytest.approx(found["confidence"][i, p], abs=1e-3)
+        for name in ("confidence", "across95", "along95"):
+            assert float(row[name]) == pytest.approx(found[name][i, p], abs=1e-3)
         assert (float(row["time"]), row["visible"]) == (i / 10, str(int(found["visible"][i, p])))
     assert found["visible"].mean() > 0.7
 

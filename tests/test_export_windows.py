@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from endoprior.cli import main
 from endoprior.model.scene_file import load_scene
 from endoprior.model.windowed_scene import Span, WindowedScene
 
+needs_usd = pytest.mark.skipif(find_spec("pxr") is None, reason="USD files need the usd-core package")
 SPANS = ((0, 10), (6, 16))
 """Frames of two windows; both show at 6 to 9."""
 
@@ -46,6 +48,7 @@ def export(run: Path, out: Path, *options: str) -> int:
         ("x.obj", ["--times", "0.45"]),
         ("x.stl", ["--times", "0.1", "--mesh-method", "tsdf", "--voxel-mm", "2"]),
         ("moving.glb", ["--format", "animation", "--mesh-step", "8"]),
+        pytest.param("x.usdz", ["--mesh-step", "8"], marks=needs_usd),
         ("x.mrb", ["--mesh-step", "8", "--split", "test"]),
         ("x.mp4", ["--split", "test"]),
         ("x.html", []),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -57,6 +58,13 @@ def demand_portable(folder: Path) -> None:
             assert b"\r\n" not in content and content.decode("utf-8"), file
         if file.name in ("index.json", "sequence.json"):
             assert os.sep not in json.dumps(json.loads(file.read_bytes())).replace("\\\\", os.sep), file
+
+
+def test_the_rules_end_with_the_context():
+    before = open, io.open, os.open, os.stat, os.unlink, os.rename
+    with windows_files():
+        pass
+    assert before == (open, io.open, os.open, os.stat, os.unlink, os.rename)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only imposed on Linux")

@@ -1,17 +1,11 @@
 """What surrounds an image, and whether the camera moves: closed forms, and no false alarms on the phantom."""
 
-from itertools import islice
-
 import cv2
 import numpy as np
 import pytest
-from conftest import REAL_DATA
 
-from endoprior.data.images import read_color
 from endoprior.footage.border import Circle, Strips, find_circle, find_strips
 from endoprior.footage.camera_motion import camera_motion
-from endoprior.footage.changes import are_combed
-from endoprior.prepare.source import open_source
 
 
 def tissue(count=6, height=120, width=160, seed=0):
@@ -99,36 +93,3 @@ def test_masked_tools_are_ignored():
     for mask in tissue_masks:
         mask[:, :240] = False
     assert camera_motion(images).moving and not camera_motion(images, tissue_masks).moving
-
-
-def woven(images):
-    """Even rows of each image, odd ones of the next."""
-    both = [image.copy() for image in images[:-1]]
-    for image, following in zip(both, images[1:], strict=True):
-        image[1::2] = following[1::2]
-    return both
-
-
-def test_combed_images_are_told_from_progressive_ones():
-    large = tissue(1, 96, 200)[0]
-    images = [large[:, 4 * i : 4 * i + 128] for i in range(8)]
-    assert are_combed(woven(images)) and not are_combed(images)
-    assert not are_combed(woven([images[0]] * 4))  # without motion
-    noise = np.random.default_rng(0).integers(0, 255, (4, 96, 128, 3)).astype(np.uint8)
-    assert not are_combed(list(noise)) and not are_combed([images[0][:12, :12]])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["broncho_phantom", "colon_boxes", "fetoscopy", "lap_smoke_stapler", "round_shaver"])
-def test_real_progressive_clips_are_not_combed(name):
-    clip = REAL_DATA / "wild" / f"{name}.mp4"
-    if not clip.is_file():
-        pytest.skip(f"real clip not present at {clip}")
-    images = [image.rgb_u8 for image in islice(open_source(clip), 96)]
-    assert not are_combed(images[::4]) and are_combed(woven(images[::2])[::4])
-
-
-@pytest.mark.slow
-def test_the_real_sequence_is_not_combed(real_clip):
-    images = [read_color(file) for file in sorted((real_clip / "images").iterdir())]
-    assert not are_combed(images[::4]) and are_combed(woven(images)[::4])

@@ -13,7 +13,7 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.data.files import bare, in_order, numbers_of
+from endoprior.data.files import bare, in_order, numbers_of, patterns_of
 from endoprior.data.frame_files import BY_NAME, BY_NUMBER, match_files, match_names, one_per_frame
 from endoprior.data.mask_folders import open_mask_folder
 
@@ -208,6 +208,18 @@ def test_times_in_seconds_are_sorted_as_numbers():
     assert [file.name for file in in_order(map(Path, sorted(parts)))] == parts
 
 
+def test_numbers_below_zero():
+    assert numbers_of(["-2", "-1", "0", "1"]) == [-2, -1, 0, 1]
+    assert numbers_of(["a_-0.5", "a_-0.25", "a_0.0", "a_0.5"]) == [-0.5, -0.25, 0, 0.5]
+    assert numbers_of(["-002", "-001", "+000", "+001"]) == [-2, -1, 0, 1]
+    assert numbers_of(["a+1", "a+2"]) == [1, 2]
+    assert patterns_of(["t-002", "t-001", "t+000", "t+001"]) == ["t#"] * 4
+    assert patterns_of(["a+1", "a+2"]) == ["a+#"] * 2
+    assert numbers_of(["v2-1", "v2-2"]) == [1, 2]
+    images, masks = ["-1", "0", "1"], ["-1_mask.png", "0_mask.png", "1_mask.png"]
+    assert found(masks, range(3), images)[0] == masks
+
+
 def test_the_number_is_the_one_that_differs():
     assert numbers_of(["v2_0007_640x512", "v2_0012_640x512"]) == [7, 12]
     assert numbers_of(["a1b1", "a2b1"]) == [1, 2]
@@ -240,6 +252,9 @@ def test_masks_beside_images_are_no_images(name):
         [f"{side}_{i:06d}.png" for i in range(5) for side in ("left", "right")],
         [f"{name}.{kind}" for name in ("a", "b") for kind in ("png", "jpg")],
         [f"{role}{i}.png" for i in range(4) for role in ("mask", "depth")],
+        [f"{i}{side}.png" for i in range(4) for side in "LR"],
+        [f"{sign}{i:03d}.png" for i in range(1, 9) for sign in ("", "-")],
+        [f"a{sign}{i}.png" for i in range(9) for sign in ("", "-")],
     ],
 )
 def test_two_series_are_named(names):
@@ -255,14 +270,23 @@ def test_two_series_are_named(names):
     [
         [f"IMG_{i}.JPG" for i in range(4)] + [f"IMG_{i}.png" for i in range(4, 9)],
         ["a1.png", "b1.png", "c1.png"],
+        [f"{i}{letter}.png" for i in range(12) for letter in "ab"],
+        [f"frame_{i:03d}{letter}.JPG" for i in range(4) for letter in ("", "A", "B", "C")],
+        [f"{i}.png" for i in range(-12, 12)],
+        [f"t{i:+04d}.png".replace("+", "") for i in range(-12, 12)],
+        ["-3.png", "-1.png", "1.png", "3.png"],
+        [f"run-2_{i}.png" for i in range(-4, 4)],
+        ["x_-0.5.png", "x_-0.25.png", "x_0.0.png", "x_0.25.png"],
+        [f"frame-{i}.png" for i in range(12)],
         [f"depth_test_{i}.png" for i in range(4)],
-        ["胃.png", "肝.png"],
+        ["肝.png", "胃.png"],
         [f"part1_{i}.png" for i in range(4)] + [f"part2_{i}.png" for i in range(4)],
         [f"intro_{i}.png" for i in range(4)] + [f"main_{i}.png" for i in range(4, 40)],
     ],
 )
 def test_one_series_in_several_spellings_is_kept(names):
-    files = in_order(map(Path, names))
+    files = list(map(Path, names))
+    assert in_order(map(Path, sorted(names))) == files
     assert one_per_frame(FOLDER, files, "images") == (files, "")
 
 

@@ -15,6 +15,8 @@ from endoprior.cli import descriptions, main
 from endoprior.cli.arguments import options
 from endoprior.cli.train import Train
 from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
+from endoprior.data import load_sequence
 from endoprior.model.presets import preset, preset_names
 
 MOST_LINES = {"train": 62}  # it lists the presets
@@ -128,7 +130,8 @@ def test_a_mistyped_choice_is_corrected(words, capsys):
     assert main([*words, "--preset", "papr"]) == 2
     assert capsys.readouterr().err.endswith("'surgicalgaussian'). Fix: `--preset paper`.\n")
     assert main([*words, "--preset", "nothing like it"]) == 2
-    assert capsys.readouterr().err.endswith(f"Fix: `endoprior {words[0]} --help-all` lists all options.\n")
+    elsewhere = "`endoprior plugins` lists the presets of other packages"
+    assert capsys.readouterr().err.endswith(f"Fix: `endoprior {words[0]} --help-all` lists all options; {elsewhere}.\n")
 
 
 @pytest.mark.parametrize(("words", "missing"), [(["a"], "OUT"), ([], "VIDEO, OUT")])
@@ -142,3 +145,39 @@ def test_every_preset_has_a_line(printed):
     for name in preset_names():
         line = next(line for line in page.splitlines() if line.startswith(f"  {name} "))
         assert 25 < len(line) <= 80, line
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["trian"], "endoprior train"),
+        (["PREPARE", "a", "b"], "endoprior prepare"),
+        (["run", "a", "b", "--preveiw"], "--preview"),
+        (["run", "a", "--preveiw"], "--preview"),
+        (["run", "a", "b", "--all-segment"], "--all-segments"),
+        (["train", "a", "b", "--iteratons", "5"], "--iterations"),
+        (["train", "a", "b", "--budget=5"], "--init.budget"),
+        (["prepare", "a", "b", "-calibration", "c"], "--calibration"),
+        (["bench", "quick", "a", "--metods", "paper"], "--methods"),
+        (["bench", "quik", "a"], "quick"),
+        (["bench", "quick", "a", "--methods", "papr"], "paper"),
+        (["eval", "a", "--protocol", "endonref"], "endonerf"),
+    ],
+)
+def test_a_mistyped_name_is_corrected(words, meant, capsys):
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.endswith(f". Did you mean `{meant}`?\n") and error.count("\n") == error.count("Fix: ") == 1
+
+
+def test_a_mistyped_preset_or_format_is_corrected_in_python():
+    with pytest.raises(InputError, match=r"got 'defualt'\. Fix: Choose one of them\. Did you mean `default`\?$"):
+        preset("defualt")
+    with pytest.raises(InputError, match=r"Fix: See docs/datasets\.md\. Did you mean `nerfstudio`\?$"):
+        load_sequence("src", DataConfig(format="nerf_studio"))
+
+
+def test_a_name_unlike_any_other_is_not_corrected(capsys):
+    for words in (["zzz"], ["run", "a", "b", "--zzz"], ["run", "a", "b", "c"]):
+        assert main(words) == 2
+        assert "Did you mean" not in capsys.readouterr().err

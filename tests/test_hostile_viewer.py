@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 from export_scenes import moving_scene
-from view_client import Client, at_work, camera_message
+from view_client import VISER, Client, at_work, camera_message
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from endoprior.core.checks import InputError
 from endoprior.view import panel as panels
 from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, MAX_WAITING, JobQueue, is_valid_message
-from endoprior.view.panel import ORBIT, control_id
+from endoprior.view.panel import CLEAR, ORBIT, control_id
 from endoprior.view.server import MAX_KEPT, Viewer, keep
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewport import bounded_aspect
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Queued a:UserWarning")  # to a b
 KEY = base64.b64encode(b"0123456789abcdef").decode()
 UPGRADE = (
     "GET {path} HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: " + KEY + "\r\nSec-WebSocket-Protocol: viser-v1.1.1\r\n\r\n"
+    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: " + KEY + "\r\nSec-WebSocket-Protocol: " + VISER + "\r\n\r\n"
 )
 
 
@@ -136,7 +136,7 @@ def messages(viewer) -> list[dict]:
             found.append({"type": "ScenePointerMessage", "event_type": kind, "screen_pos": place, **ray})
     found.append(found[-1] | {"event_type": "click", "screen_pos": [[0.5, 0.5]], "ray_origin": None})
     found.append({"type": "ViewerCameraMessage"})
-    for uuid in (ids["screenshot"], "nobody"):
+    for uuid in (ids["play"], "nobody"):
         start = {"source_component_uuid": uuid, "transfer_uuid": "t", "filename": "../../pwned", "mime_type": "x"}
         found.append({"type": "FileTransferStartUpload", **start, "part_count": 10**6, "size_bytes": 10**12})
         part = {"source_component_uuid": uuid, "transfer_uuid": "t", "content": b"x" * 50_000}
@@ -228,7 +228,7 @@ def test_a_flood_of_messages_is_limited(viewer, good):
                 k += 1
                 stranger.send_camera(position=[k % 7, 0, 0])
                 stranger.set(viewer.panel.frame, k % 9)
-                stranger.set(viewer.panel.clear, True)
+                stranger.set(viewer.panel.points, CLEAR)
         ended.append(not stop.is_set())
         stranger.socket.close()
 

@@ -13,12 +13,12 @@ ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-@pytest.mark.parametrize("extra", sorted({*PROJECT["optional-dependencies"]} - {"test"}))
+@pytest.mark.parametrize("extra", sorted({*PROJECT["optional-dependencies"]} - {"test", "test-tools"}))
 def test_the_packages_of_an_optional_part_are_those_of_pyproject(extra):
     names = [re.match(r"[\w-]+", line)[0] for line in PROJECT["optional-dependencies"][extra]]
     constraints = "" if extra == "cuda" else "-c constraints.txt "  # gsplat keeps whichever torch is there
     assert install_command(extra) == f"pip install {constraints}{' '.join(names)}"
-    if extra in ("networks", "mono", "exr", "poses", "ray", "tools"):
+    if extra in ("networks", "mono", "exr", "poses", "ray", "tools", "usd"):
         assert f"`{install_command(extra)}`" in (ROOT / "docs" / "install.md").read_text()
 
 

@@ -138,3 +138,41 @@ def test_a_plain_installation_stays_one(checkout, how):
     done = make(checkout, target=".venv/.installed")
     assert done.returncode == 0, done.stderr
     assert calls(checkout)[-1] == f"python -m pip install {'' if how == 'False' else '--editable '}."
+
+
+def ready_for_tests(checkout: Path) -> None:
+    """A checkout whose `.venv` is complete; its Python and ruff record their calls."""
+    (checkout / ".venv" / "bin").mkdir(parents=True)
+    for name in ("python", "ruff"):
+        program(checkout, name, f'#!/bin/sh\necho "{name} $*" >> calls\n')
+        (checkout / "programs" / name).rename(checkout / ".venv" / "bin" / name)
+    for name in (".installed", ".test-installed"):
+        (checkout / ".venv" / name).touch()
+
+
+@pytest.mark.parametrize("has_browser", [True, False])
+def test_make_test_installs_no_browser_and_says_that_there_is_none(checkout, has_browser):
+    ready_for_tests(checkout)
+    program(checkout, "id", "#!/bin/sh\necho 0\n")
+    program(checkout, "apt-get", '#!/bin/sh\necho "apt-get $*" >> calls\n')
+    if has_browser:
+        program(checkout, "chromium", "#!/bin/sh\n")
+    done = make(checkout, target="test")
+    assert done.returncode == 0, done.stderr
+    assert not [line for line in calls(checkout) if "apt-get" in line]
+    assert ("Fix: make browser" in done.stdout) is not has_browser
+
+
+@pytest.mark.parametrize("user", ["0", "1000"])
+def test_make_browser_installs_one_or_names_the_command(checkout, user):
+    program(checkout, "id", f"#!/bin/sh\necho {user}\n")
+    program(checkout, "apt-get", '#!/bin/sh\necho "apt-get $*" >> calls\n')
+    done = make(checkout, target="browser")
+    if user == "0":
+        assert done.returncode == 0 and "install -y --no-install-recommends chromium" in calls(checkout)[-1]
+    else:
+        assert done.returncode == 2 and "got none. Fix: sudo apt-get install chromium" in done.stderr
+        assert not (checkout / "calls").exists()
+    (checkout / "calls").unlink(missing_ok=True)
+    program(checkout, "chromium", "#!/bin/sh\n")
+    assert make(checkout, target="browser").returncode == 0 and not (checkout / "calls").exists()

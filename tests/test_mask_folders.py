@@ -253,6 +253,23 @@ def video(folder):
 OPTIONS = {"depth": "none", "poses": "still", "border": "keep"}
 
 
+@pytest.mark.parametrize(("write", "file"), [(by.nerfstudio, "transforms.json"), (by.cvat_xml, "annotations.xml")])
+def test_names_of_images_that_were_written_on_windows(write, file, tmp_path):
+    write(tmp_path)
+    frames = open_mask_folder(tmp_path).frames
+    text = (tmp_path / file).read_text()
+    changed = (
+        json.dumps(json.loads(text)).replace("/", r"\\")
+        if write is by.nerfstudio
+        else text.replace('name="', 'name="a\\')
+    )
+    assert changed != text
+    (tmp_path / file).write_text(changed)
+    found = open_mask_folder(tmp_path).frames
+    assert [each.name for each in found] == [each.name for each in frames]
+    assert all((a.read(SIZE) == b.read(SIZE)).all() for a, b in zip(found, frames, strict=True))
+
+
 @pytest.mark.parametrize("write", [by.sam2_objects, by.cvat, by.label_studio, by.nerfstudio, by.cvat_xml])
 def test_prepare_reads_them_and_says_what_it_recognized(tmp_path, write):
     write(tmp_path / "given")

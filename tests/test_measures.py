@@ -18,11 +18,11 @@ from endoprior.model.measures import (
     SurfaceMotion,
     area,
     distance,
+    fitted_strain,
     measures_of,
     neighborhoods,
     path_length,
     polygon_triangles,
-    principal_stretches,
     smoothed,
 )
 from endoprior.model.presets import preset
@@ -87,24 +87,24 @@ def test_corners_that_surround_nothing_have_no_triangles(corners):
 @pytest.mark.parametrize("curved", [False, True])
 def test_a_rigid_motion_does_not_stretch_and_a_uniform_scaling_stretches_by_its_factor(curved):
     before = turned(patch(curved), 2)
-    assert principal_stretches(before, turned(before, 3)) == pytest.approx([1, 1])
-    assert principal_stretches(before, turned(1.2 * before, 3)) == pytest.approx([1.2, 1.2])
+    assert fitted_strain(before, turned(before, 3)).stretch == pytest.approx([1, 1])
+    assert fitted_strain(before, turned(1.2 * before, 3)).stretch == pytest.approx([1.2, 1.2])
 
 
 def test_stretch_along_one_direction_leaves_the_other():
     before, after = patch(False), patch(False) * [1.3, 1, 1]
-    assert principal_stretches(turned(before, 2), turned(after, 3)) == pytest.approx([1.3, 1])
+    assert fitted_strain(turned(before, 2), turned(after, 3)).stretch == pytest.approx([1.3, 1])
     shear = patch(False) @ np.array(
         [[1, 0, 0], [0.5, 1, 0], [0, 0, 1.0]]
     )  # x + y / 2: singular values of [[1, .5], [0, 1]]
-    assert principal_stretches(before, shear) == pytest.approx(np.linalg.svd([[1, 0.5], [0, 1]])[1])
+    assert fitted_strain(before, shear).stretch == pytest.approx(np.linalg.svd([[1, 0.5], [0, 1]])[1])
 
 
 def test_stretch_of_what_is_unknown_or_thin_is_unknown():
     known = patch(True)
     broken, line = known.copy(), known * [1, 0, 0]
     broken[3, 1] = np.nan
-    found = principal_stretches(np.stack([known, broken, known, line]), np.stack([known, known, broken, line]))
+    found = fitted_strain(np.stack([known, broken, known, line]), np.stack([known, known, broken, line])).stretch
     assert np.isfinite(found[0]).all() and np.isnan(found[1:]).all()
 
 
@@ -168,6 +168,15 @@ def test_stretch_of_a_scene_is_that_of_its_gaussians(growing):
     assert found[2, 0] > 1.1 and np.isnan(found[:, 2:]).all()  # not on the surface; unknown
 
 
+def test_strain_of_a_scene_has_direction_and_area(growing):
+    points = np.array([[0.0, 0, 50], [8, -5, 50], [8, -5, 70]])
+    strain, longer = SurfaceMotion(growing, 0).strain(points, [9]), along_x(growing, 0, 9)
+    assert strain.stretch[0, :2, 1] == pytest.approx([1, 1], abs=0.03)
+    assert strain.area[0, :2] == pytest.approx([longer] * 2, abs=0.05)
+    assert np.abs(strain.direction[0, :2, 0]) == pytest.approx([1, 1], abs=0.01)
+    assert np.isnan(strain.area[0, 2]) and np.isnan(strain.direction[0, 2]).all()
+
+
 @pytest.fixture(scope="module")
 def exported(growing, tmp_path_factory):
     """The folder of `--format measures` with three points."""
@@ -188,6 +197,10 @@ def test_the_table_says_what_the_points_do(growing, exported):
     areas = np.array([float(row["area_mm2"]) for row in rows])
     assert areas == pytest.approx(wide * 10 / 80 * 50 / 2, rel=0.01)
     assert float(rows[9]["stretch_0"]) == pytest.approx(along_x(growing, 2, 9), abs=0.01)
+    for name in ("distance_range95_mm", "area_range95_mm2", "displacement_range95_1_mm"):
+        ranges = np.array([float(row[name]) for row in rows])
+        assert np.isfinite(ranges).all() and (ranges[:2] >= 0).all() and ranges[9] > 0
+    assert float(rows[2]["displacement_range95_1_mm"]) < float(rows[9]["displacement_range95_1_mm"])
     assert float(rows[2]["displacement_1_mm"]) == 0 < float(rows[1]["displacement_1_mm"])
     assert float(rows[9]["path_1_mm"]) == pytest.approx((wide[9] - wide[0]) / 2, abs=0.05)
 
@@ -197,6 +210,7 @@ def test_the_colored_surfaces_hold_the_values(growing, exported):
     assert np.nanmedian(vertex["stretch"]) == pytest.approx(along_x(growing, 2, 8), abs=0.01)
     moved = np.abs(vertex["x"]) * (along_x(growing, 2, 8) - 1)
     assert vertex["displacement"] == pytest.approx(moved, abs=0.15)  # a tenth of the Gaussians' spacing
+    assert (vertex["displacement_range95"] >= 0).all() and vertex["displacement_range95"].max() > 0
     red = PlyData.read(str(exported / "displacement.ply"))["vertex"]["red"].astype(int)
     assert red[np.argmax(moved)] > red[np.argmin(moved)]
     assert cv2.imread(str(exported / "measures.png")).std() > 20
@@ -226,6 +240,9 @@ def test_the_surface_over_time_has_its_values_for_vtk(growing, exported):
     assert first["Points"] == pytest.approx(np.stack([vertex[axis] for axis in "xyz"], 1), abs=1e-4)
     assert last["displacement"] == pytest.approx(vertex["displacement"], abs=1e-5)
     np.testing.assert_allclose(last["stretch"], vertex["stretch"], rtol=1e-6)
+    np.testing.assert_allclose(last["area_change"], last["stretch"] * last["stretch_smallest"], rtol=1e-5)
+    # Exported axes are OpenCV's unless asked otherwise; it grows along x.
+    assert np.nanmedian(np.abs(last["direction"][:, 0])) == pytest.approx(1, abs=0.01)
     wide = np.ptp(last["Points"][:, 0]) / np.ptp(first["Points"][:, 0])
     assert wide == pytest.approx(along_x(growing, 2, 8), rel=0.02)
     assert last["offsets"][-1] == len(last["connectivity"]) and last["connectivity"].max() < len(last["Points"])

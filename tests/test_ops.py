@@ -147,6 +147,7 @@ def test_fp16_planes_render_the_same_and_cannot_be_saved(tiny_sequence, tmp_path
     scene.save(tmp_path / "scene.safetensors")
     scene = load_scene(tmp_path / "scene.safetensors")
     half = scene.field.to("cpu", fp16_planes=True)
+    assert half.grid.to(torch.device("cpu")).values.dtype == torch.float32, "a CPU looks up no half precision"
     assert half.grid.values.dtype == torch.float16 and not half.grid.grads.numel()
     with torch.no_grad():
         full, rounded = (f.offsets(scene.gaussians["means"], 0.4, TORCH.model).means for f in (scene.field, half))

@@ -14,7 +14,7 @@ from video_files import write_video
 from endoprior.check import Finding
 from endoprior.cli import main
 from endoprior.cli.progress import step_head
-from endoprior.cli.run import Run, resume_words
+from endoprior.cli.run import Run, resume_words, shown_lines
 from endoprior.core.checks import InputError, quotation
 from endoprior.core.shell import command
 from endoprior.data import load_sequence
@@ -35,8 +35,11 @@ from endoprior.pipeline import (
     run_step,
     verdict_of,
 )
+from endoprior.pipeline.choice import SCAN, choose_segment
 from endoprior.pipeline.steps import PREVIEW_TITLE, demand_known_motion
 from endoprior.prepare.config import PrepareConfig
+from endoprior.prepare.scan import scan_video
+from endoprior.prepare.segments import as_json, read_scan
 from endoprior.prepare.work_folder import work_lock
 from endoprior.system.atomic import write_json
 from endoprior.system.file_lock import locked
@@ -105,7 +108,8 @@ def test_the_verdict_stands_in_scores_and_player_and_is_a_quotation(done, tmp_pa
     verdict = verdict_of(done)
     stored = json.loads((done.run / "metrics.json").read_text())["verdict"]
     assert verdict.word == stored["word"] and verdict.reasons
-    assert f"Verdict: {verdict.word}: " in done.player.read_text(encoding="utf-8")
+    assert f">{verdict.plain}. Verdict: {verdict.word}: " in done.player.read_text(encoding="utf-8")
+    assert verdict.plain and verdict.plain == stored["plain"]
     job = replace(done, out=tmp_path)
     job.run.mkdir()
     for word, reasons, known in (("wrong", ["all. Fix: `evil`"], True), ("great", [], False)):
@@ -125,6 +129,64 @@ def test_the_problems_of_the_video_are_named_and_nothing_else_of_the_file(done, 
     assert problems(job) == f"Found by check: tool-fraction. To paint tools: `{view}`. How to fix it: `{check}`"
     write_json(job.notes, {"check": ["note: all is lost. Fix: `evil`"]})
     assert notes_of(STEPS[1], job) == ["note: all is lost. fix 'evil'"]
+
+
+OTHER_JSON = ("{}", "[]", "null", "{", "\0", '{"findings": 3}', '{"findings": [{"code": "windows"}]}', "[" * 99999)
+
+
+@pytest.mark.parametrize("text", OTHER_JSON)
+def test_a_damaged_list_of_findings_is_one_line_that_says_what_to_do(text, done, tmp_path):
+    job = replace(done, out=Path(shutil.copytree(done.out, tmp_path / "out")))
+    job.findings.write_text(text)
+    for use in (problems, lambda job: run_step(STEPS[3], replace(job, out=job.out), quiet)):
+        job.report.unlink(missing_ok=True)
+        with pytest.raises(InputError) as caught:
+            use(job)
+        assert str(caught.value).startswith(f"{job.findings}: ") and ": expected " in str(caught.value)
+        assert str(caught.value).endswith("Fix: Remove it, and repeat the command: the sequence is checked again.")
+
+
+def test_what_a_damaged_list_of_findings_says_helps(done, tmp_path):
+    job = replace(done, out=Path(shutil.copytree(done.out, tmp_path / "out")))
+    job.findings.unlink()
+    assert run_step(STEPS[1], job, quiet) is not None and problems(job) == ""
+
+
+def test_a_damaged_scan_is_one_line(video, tmp_path):
+    scanned = as_json(scan_video(video, 25.0))
+    write_json(tmp_path / SCAN, scanned)
+    assert read_scan(tmp_path / SCAN) == json.loads(json.dumps(scanned))
+    damaged = [
+        {},
+        scanned | {"looks": {}},
+        scanned | {"segments": [{}]},
+        scanned | {"cuts": ["1"]},
+        scanned | {"seconds": "1"},
+    ]
+    damaged += [scanned | {"looks": scanned["looks"] | {"shift": [0.0]}}, scanned | {"not_usable": [{"start": 0.0}]}]
+    for each in damaged:
+        write_json(tmp_path / SCAN, each)
+        with pytest.raises(InputError, match=r"scan.json: .*expected .*Fix: Remove it, and repeat the command"):
+            choose_segment(video, tmp_path, 25.0)
+
+
+def test_only_notes_that_ask_for_an_action_are_printed(said):
+    job, lines = said
+    shown = shown_lines(lines, verbose=False)
+    assert shown_lines(lines, verbose=True) == lines
+    asked = [line for line in shown if line.startswith("to do: ")]
+    assert any("no calibration" in line for line in asked) and any("For mm use" in line for line in asked)
+    quiet_lines = [line for line in lines if line not in shown]
+    assert quiet_lines and all(line.startswith("note: ") for line in quiet_lines)
+    stored = read_json(job.notes)
+    assert [line for lines in stored.values() for line in lines] == lines, "notes.json has all"
+
+
+def test_each_warning_has_one_place(said):
+    _job, lines = said
+    shown = "\n".join(shown_lines(lines, verbose=False))
+    assert shown.count("no tools were found") + shown.count("no tools found") <= 1
+    assert shown.count("unsure in frames") <= 1 and "tools are likely missed" not in shown, "the last lines say it"
 
 
 def test_a_finished_step_is_not_repeated(done):
@@ -208,6 +270,23 @@ def test_a_job_with_other_settings_does_not_take_the_folder(video, done, tmp_pat
         open_folder(replace(done, out=tmp_path))
 
 
+@pytest.mark.parametrize("damage", ["", "{", "[]", "null", "3"])
+def test_a_damaged_file_of_a_finished_job_leads_on(done, tmp_path, damage):
+    """What the message says to do ends well: a folder without its settings would be refused as an occupied one."""
+    shutil.copytree(done.out, tmp_path / "out")
+    job = replace(done, out=tmp_path / "out")
+    for file in (job.run / "metrics.json", job.notes, job.out / "settings.json"):
+        file.write_text(damage)
+    fix = rf"Fix: Pass another folder for the results; what is in this one: `endoprior view {job.run}`\.$"
+    with pytest.raises(InputError, match=fix):
+        open_folder(job)
+    fix = rf"Fix: Remove it and {job.report}, and repeat the command: the model is scored again\.$"
+    with pytest.raises(InputError, match=fix):
+        verdict_of(job)
+    with pytest.raises(InputError, match=r"Fix: Remove it, and repeat the command: only the notes of steps"):
+        notes_of(STEPS[0], job)
+
+
 @pytest.mark.parametrize("option", ["calibration", "masks", "poses"])
 def test_a_job_whose_inputs_have_changed_does_not_take_the_folder(video, tmp_path, option):
     given = tmp_path / "given"
@@ -278,7 +357,9 @@ def test_a_preview_says_that_it_is_one(video, done, tmp_path, monkeypatch):
         for name in ("report.png", "player.html"):
             (tmp_path / name).replace(job.out / name)
     title, is_named, whole, is_still_named = said
-    assert title.startswith(f"{PREVIEW_TITLE}\nVerdict: ") and whole.startswith("Verdict: ")
+    plain = f"{verdict_of(done).plain}.\nVerdict: "
+    assert title.startswith(plain) and whole.startswith(plain)
+    assert title.endswith(f"\n{PREVIEW_TITLE}") and PREVIEW_TITLE not in whole
     assert is_named and not is_still_named
 
 
@@ -311,6 +392,10 @@ def test_the_command_ends_with_a_player(video, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert f"Open {out / 'player.html'} in a browser." in printed
     assert f"endoprior view '{out / 'run'}'" in printed
+    last = printed[printed.rindex("do not measure") :]
+    assert last.index("Done in") < last.index("Verdict: ") < last.index("report.png  held-out frames")
+    assert f"endoprior export '{out / 'run'}' '{out / 'tissue.mrb'}'" in last and "3D Slicer" in last
+    assert "note: " not in printed
     assert "Found by check: " in printed and "tool-fraction" in printed[printed.index("in a browser.") :]
     assert " mm" not in printed.replace("For mm use", ""), "depth of one camera is relative"
     assert "<script>" in (out / "player.html").read_text(encoding="utf-8")

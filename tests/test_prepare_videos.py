@@ -225,6 +225,14 @@ def test_videos_without_a_common_time_are_an_error(tmp_path, pair):
         prepared(left, tmp_path, right=right, **options)
 
 
+def test_nearly_white_images_are_said(tmp_path):
+    video = write_video(tmp_path / "w.mkv", [255 - image // 16 for image in smooth(12)])
+    _, notes, _ = prepared(video, tmp_path, depth="none")
+    assert any(note.startswith("the images are nearly white: their darkest parts have 2") for note in notes)
+    with pytest.raises(InputError, match=r"expected tissue that is neither masked nor white, got none\. Fix: "):
+        prepared(video, tmp_path / "shading", depth="shading")
+
+
 def test_nearly_black_images_are_said(tmp_path):
     video = write_video(tmp_path / "d.mkv", [image // 16 for image in smooth(12)])
     done, notes, _ = prepared(video, tmp_path, depth="shading")

@@ -56,6 +56,12 @@ def test_a_notebook_shows_one_line(train_tiny, in_notebook, capfd):
     assert not out and "\rfine 3/3" in err and err.rstrip().endswith("Gaussians")
 
 
+def test_an_interrupted_line_of_a_notebook_ends(in_notebook, capfd):
+    with pytest.raises(KeyboardInterrupt), training_progress():
+        raise KeyboardInterrupt
+    assert capfd.readouterr().err == "\n"
+
+
 def test_asked_for_in_a_script_it_is_plain_lines(train_tiny, capfd):
     train_tiny(True)
     out, err = capfd.readouterr()

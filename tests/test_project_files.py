@@ -2,6 +2,8 @@
 
 import re
 import runpy
+import subprocess
+import sys
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -69,6 +71,44 @@ def test_the_changelog_has_a_section_for_the_release():
         notes("v0.0.1")
 
 
+def test_the_changelog_sorts_what_changed_by_kind():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    versions = re.split(r"^## ", text, flags=re.MULTILINE)[1:]
+    assert [part.split("\n")[0] for part in versions[:1]] == ["Unreleased"]
+    for part in versions:
+        kinds = re.findall(r"^#+ (.*)$", part, re.MULTILINE)
+        assert kinds == [kind for kind in ("Added", "Changed", "Removed", "Fixed") if kind in kinds], part[:40]
+        assert not re.search(r"^- ", part.partition("\n###")[0], re.MULTILINE), "expected a kind above each line"
+
+
+SUBJECTS = runpy.run_path(str(ROOT / "tools" / "check_subjects.py"))
+
+
+def test_one_rule_for_first_lines_serves_hook_and_workflow(tmp_path):
+    problem = SUBJECTS["problem"]
+    assert problem("a" * 72) is None
+    assert problem("a" * 73).endswith("expected at most 72 characters, got 73")
+    assert problem(" ") == "expected a first line, got none"
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    workflow = (ROOT / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8")
+    (hook,) = (hook for hook in hooks if hook.get("stages") == ["commit-msg"])
+    assert hook["entry"] == "python tools/check_subjects.py" and f"{hook['entry']} --commits" in workflow
+    message = tmp_path / "message"
+    for subject, status in (("Short", 0), ("a" * 80, 1)):
+        message.write_text(f"{subject}\n\n{'b' * 90}\n")
+        assert subprocess.run([sys.executable, ROOT / "tools" / "check_subjects.py", message]).returncode == status
+
+
+def test_subjects_of_a_range_of_commits_are_checked(tmp_path):
+    git = ["git", "-c", "user.name=test", "-c", "user.email=test@localhost"]
+    subprocess.run([*git, "init", "--quiet"], cwd=tmp_path, check=True)
+    for subject in ("first", "second " + "x" * 70):
+        subprocess.run([*git, "commit", "--quiet", "--allow-empty", "-m", subject], cwd=tmp_path, check=True)
+    words = [sys.executable, ROOT / "tools" / "check_subjects.py", "--commits"]
+    done = [subprocess.run([*words, commits], cwd=tmp_path, capture_output=True) for commits in ("HEAD~1", "HEAD")]
+    assert [each.returncode for each in done] == [0, 1] and b"got 77" in done[1].stderr
+
+
 def test_workflows_run_actions_of_one_commit_only():
     """A tag of an action can be moved to other code, a commit cannot."""
     files = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -94,3 +134,24 @@ def test_the_workflow_runs_what_it_names():
     for word in ("-c constraints.txt", "pytest -n 2 --dist loadfile"):
         assert word in steps
     assert workflow["jobs"]["lint"]["steps"][-1]["run"] == "make lint"
+    for name, words in {"lowest": "--resolution lowest-direct -e", "minimal": "-c constraints.txt -e"}.items():
+        job = workflow["jobs"][name]
+        assert job["steps"][1]["with"]["python-version"] == oldest
+        steps = "\n".join(step.get("run", "") for step in job["steps"])
+        assert f'{words} ".[test-tools]"' in steps and "pytest -n 2 --dist loadfile" in steps, name
+
+
+def test_updates_are_proposed_for_actions_and_packages():
+    updates = yaml.safe_load((ROOT / ".github" / "dependabot.yml").read_text())["updates"]
+    assert {each["package-ecosystem"] for each in updates} == {"github-actions", "pip"}
+
+
+def test_no_install_command_asks_the_index_of_small_torch_for_every_package():
+    """Behind a firewall pip tries it five times for each package."""
+    pages = [ROOT / name for name in ("README.md", "Dockerfile", "docs/install.md", ".github/workflows/release.yml")]
+    lines = [line for page in pages for line in page.read_text().splitlines() if re.search("pip (install|wheel)", line)]
+    of_torch = [line for line in lines if "whl/cpu" in line]
+    assert len(of_torch) == 5 and all(" torch --no-deps --index-url " in line for line in of_torch)
+    readme = (ROOT / "README.md").read_text()
+    first, *_ = re.findall(r"^pip install .*", readme, re.MULTILINE)
+    assert first == "pip install -c constraints.txt ." and readme.index(first) < readme.index("whl/cpu")

@@ -121,6 +121,11 @@ def test_exactly_the_unusable_is_rejected(made):
         train = sequence.indices("train")
         usable = any((tissue[i] & known[i]).any() for i in train)
         if usable:
+            levels = [frames[i][0][tissue[i] & known[i]].min(-1) for i in train]
+            if sum((each < 250).sum() for each in levels) < 0.01 * sum(map(len, levels)):
+                with pytest.raises(InputError, match="the images are white"):
+                    sequence.validate()
+                return
             assert all("\n" not in remark for remark in sequence.validate())
             return
         with pytest.raises(InputError) as refusal:

@@ -272,7 +272,11 @@ def test_each_classifier_is_loaded_once_and_sees_the_range_of_the_protocol(tmp_p
     folder = noisy(tmp_path / "theirs", sequence)
     monkeypatch.setattr("endoprior.evaluation.protocols.compute.lpips_distance", load)
     monkeypatch.setattr("endoprior.evaluation.scoring.scorers", dict)
-    found = evaluate(Pictures(folder / "rgb", sequence, "test"), sequence, protocols=NAMES).protocols
+    pictures = Pictures(folder / "rgb", sequence, "test")
+    evaluate(pictures, sequence, protocols=NAMES)
+    assert sorted(asked) == [("alex", False), ("vgg", False)]
+    asked.clear()
+    found = evaluate(pictures, sequence, protocols=NAMES, download=True).protocols
     assert sorted(asked) == [("alex", True), ("vgg", False)]
     assert (
         found["endosurf"]["skipped"]["lpips"] == "no weights for VGG16" and "lpips" not in found["endosurf"]["scores"]

@@ -19,6 +19,7 @@ from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation import context
 from endoprior.evaluation.scorers import model
 from endoprior.evaluation.scoring import evaluate
+from endoprior.export import export
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.remote import train_here, trainings
@@ -294,3 +295,7 @@ def test_a_run_folder_is_like_any_other(sequence: FrameSequence, tmp_path: Path)
         assert same(dict(scene.field.state_dict()), dict(other.field.state_dict()))
     with pytest.raises(InputError, match="expected a scene of Gaussians, got a radiance field"):
         open_gaussians(tmp_path / "run")
+    for use in (lambda: loaded.at(0.5), lambda: export(loaded, tmp_path / "x.ply")):
+        with pytest.raises(InputError, match=r"scene: expected a scene of Gaussians, got a radiance field"):
+            use()
+    assert not (tmp_path / "x.ply").exists()

@@ -182,6 +182,43 @@ def test_masks_that_frames_name_say_what_to_ignore(nerfstudio):
     assert seq.frame(4).tissue_mask[:, :30].all()
 
 
+def test_paths_that_were_written_on_windows(nerfstudio, tmp_path):
+    """Of images, masks and depth; and a name that holds a backslash is still found where there is one."""
+    for kind in ("masks", "mm"):
+        (nerfstudio / kind).mkdir()
+    mask = np.full((80, 96), 255, np.uint8)
+    mask[:, :30] = 0
+    for i in range(FRAMES):
+        write(nerfstudio / f"masks/frame_{i:05d}.png", mask)
+        write(nerfstudio / f"mm/frame_{i:05d}.png", np.full((80, 96), 77, np.uint16))
+
+    def name(frame):
+        image = frame["file_path"].replace("/", "\\")
+        parts = {"mask_path": image.replace("images", "masks"), "depth_file_path": image.replace("images", "mm")}
+        frame |= {"file_path": f".\\{image}"} | parts
+
+    poses = read_model_poses(nerfstudio, range(FRAMES))[0]
+    edit_frames(nerfstudio, name)
+    seq = load_sequence(nerfstudio)
+    assert seq.image_names == [f"frame_{i:05d}" for i in range(FRAMES)]
+    assert not seq.frame(0).tissue_mask[:, :30].any() and np.ptp(seq.frame(0).depth) == 0
+    assert np.array_equal(read_model_poses(nerfstudio, range(FRAMES))[0], poses)
+    (nerfstudio / "images/frame_00003.png").rename(nerfstudio / ".\\images\\frame_00003.png")
+    assert len(load_sequence(nerfstudio)) == FRAMES
+    edit_frames(nerfstudio, lambda frame: frame.update(file_path="C:\\" + frame["file_path"]))
+    assert_rejected(nerfstudio, "transforms.json", "paths from its folder, got C:")
+
+
+def test_colmap_names_that_were_written_on_windows(tmp_path):
+    folder = write_colmap(tmp_path / "scene", "text")
+    (folder / "images").rename(folder / "left")
+    (folder / "images").mkdir()
+    (folder / "left").rename(folder / "images" / "left")
+    file = folder / "sparse/0/images.txt"
+    file.write_text(file.read_text().replace("frame_", "left\\frame_"))
+    assert load_sequence(folder).image_names[0] == "frame_00000"
+
+
 def test_masks_of_colmap_are_called_after_the_image(tmp_path):
     folder = write_colmap(tmp_path / "scene", "text")
     (folder / "masks").mkdir()

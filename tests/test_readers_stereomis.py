@@ -188,7 +188,7 @@ BAD_TEXT = {
         "1 0 0 0 0 0 0 1",
         "a row for each image of the video that is used, got 1 rows, none for image 2",
     ),
-    "7 numbers": ("0 0 0 0 0 0 1\n0 0 0 0 0 0 1", "rows of 8 numbers, got 7"),
+    "7 numbers": ("0 0 0 0 0 0 1\n0 0 0 0 0 0 1", "rows of 8 or 12 numbers, got 7"),
     "zero quaternion": ("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 1", "quaternions of length 1, got length 0 of that of frame 0"),
     "mm": ("1 0 0 0 0 0 0 1\n2 30 0 0 0 0 0 1", "positions in m, within 2 m, got a path that reaches 30"),
 }

@@ -156,7 +156,7 @@ def test_no_number_of_a_config_may_be_nan_or_without_bounds(cls):
 @pytest.mark.parametrize("name", ["cell.json", "metrics.json"])
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"[" * 100_000, bytes(range(256))])
 def test_a_benchmark_cell_that_cannot_be_read_is_not_finished(tmp_path, name, content):
-    (tmp_path / "cell.json").write_text('{"key": "k"}')
+    (tmp_path / "cell.json").write_text('{"key": "k", "seconds": 1.0}')
     (tmp_path / "metrics.json").write_text('{"scores": {"psnr": 30.0}}')
     assert finished(tmp_path, "k") and not finished(tmp_path, "other")
     (tmp_path / name).write_bytes(content)

@@ -13,7 +13,7 @@ from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence, shrunk
 from endoprior.data.contents import weighted
 from endoprior.data.writer import FrameFiles, SequenceMeta
-from endoprior.initialization.sampling import initial_points
+from endoprior.initialization.sampling import initial_points, pixel_probability
 from endoprior.model.presets import preset
 from endoprior.training.frames import TrainingFrames
 
@@ -72,7 +72,7 @@ def test_weights_are_written_where_they_say_something(tmp_path, tiny_sequence):
     assert json.loads((tmp_path / "sequence.json").read_text())["frame_weights"] == [1.0, 0.25]
 
 
-def test_usual_highlights_count_and_a_saturated_part_does_not(tiny_sequence):
+def test_usual_highlights_count_and_a_saturated_part_counts_half(tiny_sequence):
     frame = load_sequence(tiny_sequence).frame(0)
     assert frame.weight is None
     rgb = frame.rgb_u8.copy()
@@ -80,7 +80,15 @@ def test_usual_highlights_count_and_a_saturated_part_does_not(tiny_sequence):
     assert weighted(replace(frame, rgb_u8=rgb), 1.0).weight is None
     rgb[15:30, 20:35] = 255
     weight = weighted(replace(frame, rgb_u8=rgb), 0.5).weight
-    assert not weight[15:30, 20:35].any() and (weight[:10] == 0.5).all() and not weight[14, 20:35].any()
+    assert (weight[15:30, 20:35] == 0.25).all() and (weight[:10] == 0.5).all() and (weight[14, 20:35] == 0.25).all()
+
+
+def test_overexposed_tissue_keeps_its_place(tiny_sequence):
+    frame = load_sequence(tiny_sequence).frame(0)
+    rgb, sampler = frame.rgb_u8.copy(), replace(preset("default").init, sampler="prior")
+    rgb[15:30, 20:35] = 255
+    white = weighted(replace(frame, rgb_u8=rgb, tissue_mask=np.ones_like(frame.tissue_mask)), 1.0)
+    assert (pixel_probability(white, sampler)[15:30, 20:35] > 0).sum() == white.depth_valid[15:30, 20:35].sum() > 0
 
 
 def test_a_shrunk_weight_is_the_mean_of_its_block(tiny_sequence):

@@ -35,6 +35,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.types import Splats
 from endoprior.render.constants import ALPHA_MAX, ALPHA_MIN, MIN_QUAT, NEAR_Z
 from endoprior.render.projection import project
+from endoprior.render.rasterization import rasterize
 
 pytest.importorskip("triton")
 if os.environ.get("TRITON_INTERPRET") != "1":
@@ -47,6 +48,22 @@ backend, tiles, projection = (
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 CPU = torch.device("cpu")
 NAN, INF = float("nan"), float("inf")
+
+
+def test_the_public_rasterizer_agrees_with_reference():
+    view = camera(23, 13)
+    scene = splats(view, 40, degree=1)
+    matrix = torch.tensor([[[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]]])
+    found = {}
+    for name, dtype in (("reference", torch.float64), ("triton", torch.float32)):
+        tensors = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
+        inputs = [value.to(dtype).requires_grad_() for value in tensors]
+        views = torch.tensor(view.world_to_camera, dtype=dtype)[None].requires_grad_()
+        image, alpha, _ = rasterize(*inputs, views, matrix, 23, 13, sh_degree=1, render_mode="RGB+D", backend=name)
+        (image.square().sum() + alpha.sum()).backward()
+        found[name] = [image.detach(), *(value.grad for value in (*inputs, views))]
+    for got, want in zip(found["triton"], found["reference"], strict=True):
+        assert (got - want).norm() <= 1e-4 * want.norm() and want.norm() > 0
 
 
 @pytest.mark.parametrize(

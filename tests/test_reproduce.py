@@ -108,7 +108,7 @@ def test_an_estimate_counts_each_part_of_a_schedule(tmp_path):
     (tmp_path / "run" / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (tmp_path / "cell.json").write_text(json.dumps({"seconds": 30 * (1 + 2 + 5) + 126.0}))
     speed = Speed.of(tmp_path, parts, 63)
-    assert speed.iteration == [1.0, 0.0, 2.0, 5.0] and math.isclose(speed.beside, 2.0)
+    assert speed.iteration == (1.0, 0.0, 2.0, 5.0) and math.isclose(speed.beside, 2.0)
     assert math.isclose(speed.seconds(parts_of(cfg), 156), 1000 + 1000 * 2 + 2000 * 5 + 156 * 2)
     assert Speed.of(tmp_path, parts, 63) == speed, "a second estimate does not measure again"
 
@@ -199,3 +199,21 @@ def test_an_estimate_trains_shortly_and_then_nothing(clips, tmp_path, capsys):
     assert len(finished(tmp_path / "out")) == 1 and not (tmp_path / "out" / "results.md").exists()
     assert main([*words, "--estimate"]) == 0
     assert "[1/1]" in text and "[1/1]" not in capsys.readouterr().out, "what was measured is kept"
+
+
+def test_the_page_of_a_spec_has_the_names_that_it_needs_and_what_they_are(capsys):
+    assert main(["bench", "reproduce", "--help"]) == 0
+    page = capsys.readouterr().out
+    assert len(page.splitlines()) <= 45 and max(map(len, page.splitlines()[:-4])) <= 120
+    for name, words in (
+        ("pulling", "EndoNeRF: pulling_soft_tissues, 63 frames"),
+        ("cutting", "EndoNeRF: cutting_tissues_twice, 156 frames"),
+        ("d1", "SCARED: dataset_1/keyframe_1, the folder that holds data/"),
+        ("d7", "SCARED: dataset_7/keyframe_1, the folder that holds data/"),
+    ):
+        assert re.search(rf"^  {name} +{re.escape(words)}", page, re.MULTILINE), name
+    for name in ("reproduce/table1_scared", "endosurf,", "endogaussian", "--data pulling=FOLDER cutting=FOLDER"):
+        assert name in page
+    for name in ("quick", "reproduce/table1", "whole/own"):
+        assert main(["bench", name, "-h"]) == 0
+        assert capsys.readouterr().out.startswith(f"usage: endoprior bench {name} OUT")

@@ -89,7 +89,7 @@ def test_what_cannot_be_resumed(interrupted, parts, tmp_path, capsys):
     assert main(["train", "--resume", str(tmp_path / "nowhere")]) == 2
     assert "nowhere/config.json: expected a JSON object" in complaint(capsys)
     assert main(["train", str(interrupted[0])]) == 2
-    assert "Fix: `endoprior train DATA RUN`" in complaint(capsys)
+    assert f"Fix: `endoprior train {interrupted[0]} RUN`" in complaint(capsys)
     facts = json.loads((parts / "config.json").read_text())
     (parts / "config.json").write_text(json.dumps(facts | {"data": facts["data"] | {"path": "/gone"}}))
     assert main(["train", "--resume", str(parts)]) == 2

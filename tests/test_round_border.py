@@ -115,7 +115,7 @@ def test_strips_are_measured_inside_the_circle():
 
 
 def test_an_uncertain_border_is_a_note_with_its_fix():
-    sure, unsure = (border_notes(None, Circle(50, 40, 35, 2.0, agreement), [], 0.1) for agreement in (0.9, 0.5))
+    sure, unsure = (border_notes(None, Circle(50, 40, 35, 2.0, agreement), 0.1) for agreement in (0.9, 0.5))
     assert len(sure) == 1 and "rim of 2 px" in sure[0]
     assert len(unsure) == 2 and "50% of it" in unsure[1] and "--border keep" in unsure[1]
 

@@ -12,7 +12,7 @@ from endoprior.cli.sample import write_sample
 from endoprior.data import load_sequence
 from endoprior.phantom.camera import Eye
 from endoprior.phantom.raster import FAR, rasterize
-from endoprior.phantom.sample import SampleConfig, phantom_of, rays_of
+from endoprior.phantom.sample import RECORDED, SampleConfig, phantom_of, rays_of, sample_frames
 from endoprior.phantom.scene import build_scene
 from endoprior.phantom.views import RenderedView
 from endoprior.prepare.calibration_files import read_calibration
@@ -88,7 +88,7 @@ def test_points_are_where_the_calibration_says(tmp_path, monkeypatch):
             light -= np.median(np.concatenate([light[0], light[-1], light[:, 0], light[:, -1]]))
             down, across = np.mgrid[i - 5 : i + 6, j - 5 : j + 6]
             found = np.array([(light * across).sum(), (light * down).sum()]) / light.sum()
-            assert np.abs(found - (x, y)).max() < 0.1
+            assert np.abs(found - (x, y)).max() < 0.2  # the codec moves 0.1; a center taken elsewhere is 0.5 off
 
 
 @pytest.mark.parametrize("right", [0, 1])
@@ -112,6 +112,19 @@ def test_a_folder_in_use_and_a_bad_seed_are_errors(tmp_path, capsys):
     assert [path.name for path in tmp_path.rglob("*")] == ["used", "kept"]
 
 
+def test_the_clip_of_the_default_seed_comes_with_the_program(tmp_path):
+    assert main(["sample", str(tmp_path / "s")]) == 0
+    assert (tmp_path / "s/sample.mp4").read_bytes() == RECORDED.read_bytes() and RECORDED.stat().st_size < 700_000
+    assert len(decoded(RECORDED)) == SampleConfig().frames
+
+
+@pytest.mark.slow
+def test_the_stored_clip_is_what_would_be_drawn():
+    """Up to the codec, which smooths the noise. Else `write_sample` draws a new one for `RECORDED`."""
+    drawn = next(iter(sample_frames(SampleConfig()))).astype(np.float64)
+    assert 10 * np.log10(255**2 / ((decoded(RECORDED)[0] - drawn) ** 2).mean()) > 28
+
+
 @pytest.mark.slow
 def test_prepared_it_has_the_true_depth(tmp_path, capsys):
     """The whole clip by the commands: border and label are found, and depth is that of the phantom."""
@@ -121,7 +134,7 @@ def test_prepared_it_has_the_true_depth(tmp_path, capsys):
     calibration = out / "calibration.yaml"
     assert main(["prepare", str(out / "sample.mp4"), str(data), "--calibration", str(calibration)]) == 0
     said = capsys.readouterr().out
-    assert "round border: center (240, 192), radius 2" in said and said.count("label was painted over") == 2
+    assert "round border: center (240, 192), radius 2" in said and "burnt-in text: text in 60 frames at " in said
     sequence, scene = load_sequence(data), build_scene(phantom_of(cfg, [rays_of(cfg, right) for right in (0, 1)]))
     turn = rectify(read_calibration(calibration), (cfg.width, cfg.height), "c", stereo=True)[1]
     assert len(sequence) == cfg.frames

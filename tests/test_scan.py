@@ -63,9 +63,9 @@ def test_the_longest_clear_segment_is_chosen_and_a_scan_is_kept(disturbed, tmp_p
     assert "segment 3 of 5" in lines[0]
     assert "blur 0.6 s" in lines[1]
     assert all("--segment" in line for line in lines[2:5])
-    (tmp_path / "scan.json").write_text(json.dumps(choice.scanned | {"cuts": ["stored"]}))
+    (tmp_path / "scan.json").write_text(json.dumps(choice.scanned | {"cuts": [0.25]}))
     again = choose_segment(disturbed / "images", tmp_path / "out", RATE, 2)
-    assert again.scanned["cuts"] == ["stored"]
+    assert again.scanned["cuts"] == [0.25]
     assert [round(time * RATE) for time in again.span] == [18, 30]
 
 

@@ -108,3 +108,52 @@ def test_jitter_within_half_a_step_loses_nothing():
     times[0] = 0
     found, _ = taken(times, frames_per_second=25, source_rate=25)
     assert found == list(range(200))
+
+
+def write_series(folder, numbers, name="f{}.png", channels=3):
+    """Images whose levels are their positions among `numbers`."""
+    folder.mkdir()
+    for level, number in enumerate(numbers):
+        pixels = np.full((24, 32, channels), level, np.uint8)
+        if channels == 4:
+            pixels[..., 3] = np.where(np.arange(32) < 8, 0, 255)
+        cv2.imwrite(str(folder / (name[number % 2] if isinstance(name, tuple) else name).format(number)), pixels)
+    return folder
+
+
+def test_names_that_differ_by_capitals_are_one_series(tmp_path):
+    source = open_source(write_series(tmp_path / "a", range(12), ("IMG_{:04d}.PNG", "img_{:04d}.png")))
+    assert [int(image.rgb_u8[0, 0, 0]) for image in source] == list(range(12)) and source.notes == []
+    (tmp_path / "a/IMG_0004.png").write_bytes((tmp_path / "a/IMG_0004.PNG").read_bytes())
+    assert len(list((tmp_path / "a").iterdir())) == 13
+    with pytest.raises(InputError, match="one series of images, one file per frame"):
+        open_source(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ([0, 1, 2, 5, 6, 9], "4 numbers are missing, between f2.png and f5.png, and in 1 more places"),
+        ([10, 15, 20, 30, 35], "1 numbers are missing, between f20.png and f30.png"),
+        ([0, 33, 67, 100, 133, 200], "1 numbers are missing, between f133.png and f200.png"),
+        ([0, 33, 67, 100, 133, 167], ""),
+        ([3, 8, 13, 18], ""),
+        ([7, 6, 5], ""),
+    ],
+)
+def test_numbers_that_a_series_leaves_out_are_said(tmp_path, numbers, said):
+    source = open_source(write_series(tmp_path / "a", numbers))
+    assert source.notes == ([f"a: {said}; the files count as evenly spaced in time"] if said else [])
+
+
+def test_transparent_parts_are_said(tmp_path):
+    source = open_source(write_series(tmp_path / "a", range(5), channels=4))
+    assert [image.rgb_u8.shape for image in source] == [(24, 32, 3)] * 5
+    said = "5 images have transparent parts; their color is used there, whatever it is"
+    fix = f"To leave it out: `--masks {tmp_path / 'a'} --mask-tool-value low`"
+    assert source.notes == [f"a: {said}. {fix}"]
+    for path in (tmp_path / "a").iterdir():
+        cv2.imwrite(str(path), np.full((24, 32, 4), 255, np.uint8))
+    source = open_source(tmp_path / "a")
+    list(source)
+    assert source.notes == []

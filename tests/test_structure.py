@@ -20,7 +20,8 @@ FLOORS = [
     {"system", "render", "priors", "footage"},
     {"data", "model"},
     {"initialization", "evaluation", "visualization", "phantom", "tool_masks"},
-    {"training", "prepare", "check", "export", "view"},
+    {"training", "prepare", "check", "export"},
+    {"view"},
     {"runs"},
     {"pipeline"},
     {"cli"},
@@ -51,8 +52,8 @@ def nodes(path: Path) -> list[ast.AST]:
     return list(ast.walk(tree(path)))
 
 
-def imports(path: Path) -> Iterator[tuple[str, ...]]:
-    """Own modules that a file imports, as paths below the package; those for type checking only left out."""
+def imports(path: Path, types: bool = False) -> Iterator[tuple[str, ...]]:
+    """Own modules that a file imports, as paths below the package; those for type checking only if `types` says so."""
     skipped = {
         id(child)
         for node in nodes(path)
@@ -61,7 +62,7 @@ def imports(path: Path) -> Iterator[tuple[str, ...]]:
     }
     parts = path.relative_to(SRC).parts
     for node in nodes(path):
-        if isinstance(node, ast.ImportFrom) and node.level and id(node) not in skipped:
+        if isinstance(node, ast.ImportFrom) and node.level and (types or id(node) not in skipped):
             base = parts[: len(parts) - node.level]
             if node.module:
                 yield *base, *node.module.split(".")
@@ -91,26 +92,40 @@ def test_the_product_knows_nothing_of_what_is_added_to_it():
     assert not [path for path in ADDED[1].rglob("*.py") if baselines in path.read_text()]
 
 
-def test_no_module_imports_itself_in_a_circle():
+def circles(types: bool) -> list[set[str]]:
+    """The modules that import one another in circles, by circle; with imports for type checking if `types` says so."""
     names = {path.relative_to(SRC).with_suffix("").parts: path for path in FILES}
-    edges = {name: {target for target in imports(path) if target in names} for name, path in names.items()}
-    done: set[tuple[str, ...]] = set()
+    edges = {name: {target for target in imports(path, types) if target in names} for name, path in names.items()}
 
-    def visit(name: tuple[str, ...], trail: tuple[tuple[str, ...], ...]) -> None:
-        assert name not in trail, " -> ".join(".".join(part) for part in (*trail, name))
-        if name not in done:
-            for target in edges[name]:
-                visit(target, (*trail, name))
-            done.add(name)
+    @cache
+    def reached(name: tuple[str, ...]) -> set[tuple[str, ...]]:
+        found, waiting = set(), [name]
+        while waiting:
+            new = edges[waiting.pop()] - found
+            found |= new
+            waiting.extend(new)
+        return found
 
-    for name in names:
-        visit(name, ())
+    in_circles = {name for name in names if name in reached(name)}
+    groups = {frozenset(other for other in in_circles if other in reached(name) and name in reached(other))
+              for name in in_circles}  # fmt: skip
+    return [{".".join(name) for name in group} for group in groups]
+
+
+def test_no_module_imports_itself_in_a_circle():
+    assert circles(types=False) == []
+
+
+def test_no_further_module_names_types_in_a_circle():
+    """Imports for type checking make circles for readers, too; three are left."""
+    circles_of = {tuple(sorted({name.partition(".")[0] for name in group})) for group in circles(types=True)}
+    assert circles_of <= {("data",), ("model", "training"), ("training",)}
 
 
 def test_files_are_short_and_say_what_they_are():
     for path in ALL_FILES:
         text = path.read_text()
-        assert len(text.splitlines()) <= 400, path
+        assert len(text.splitlines()) <= 600, path
         assert not text.strip() or ast.get_docstring(tree(path)), path
 
 

@@ -71,6 +71,27 @@ def test_a_benchmark_and_its_processes_run_no_code_of_the_current_folder(tiny_se
     assert not (tmp_path / "EXECUTED").exists()
 
 
+# A read-only installation and no home: Numba finds no folder for compiled kernels.
+NO_FOLDER = """import sys
+from numba.core import caching
+for each in vars(caching).values():
+    if hasattr(each, "_locator_classes"):
+        each._locator_classes = []
+"""
+AS_A_COMMAND = f"{NO_FOLDER}from endoprior.cli import main\nsys.exit(main(sys.argv[1:]))"
+IN_A_PROGRAM = (
+    f"{NO_FOLDER}import endoprior\ntry:\n    endoprior.train\nexcept endoprior.InputError as error:\n    print(error)"
+)
+
+
+@pytest.mark.parametrize("words", [["render", "run"], ["prepare", "--help"], ["phantom", "out", "--frames", "2"], []])
+def test_without_a_folder_for_kernels_there_is_one_line(words, tmp_path):
+    done = start([sys.executable, "-c", AS_A_COMMAND if words else IN_A_PROGRAM, *words], tmp_path)
+    (line,) = (done.stderr if words else done.stdout).splitlines()
+    assert done.returncode == (2 if words else 0) and "NUMBA_CACHE_DIR: expected a folder for compiled kernels" in line
+    assert "Fix: `export NUMBA_CACHE_DIR=FOLDER`" in line and not [*tmp_path.iterdir()]
+
+
 # Settings in the current folder.
 
 
@@ -80,7 +101,10 @@ def hostile_settings(folder: Path) -> None:
     (folder / "matplotlibrc").write_text("text.usetex: True\nlines.linewidth: 77\nbackend: module://evil\n")
 
 
-@pytest.mark.parametrize("first", ["import endoprior", "import numba; import endoprior"])
+AS_COMMAND = "from endoprior.cli import main; main(['--version'])"
+
+
+@pytest.mark.parametrize("first", [AS_COMMAND, f"import numba; {AS_COMMAND}"])
 def test_settings_in_the_current_folder_are_not_read(first, tmp_path):
     hostile_settings(tmp_path)
     if "numba" in first:  # which has read them: what it would load from is taken back
@@ -91,8 +115,64 @@ def test_settings_in_the_current_folder_are_not_read(first, tmp_path):
         "import numba.core.config as n; n.reload_config(); print(repr(c.CACHE_DIR))"
     )
     done = start([sys.executable, "-P", "-c", code], tmp_path, NUMBA_CACHE_DIR="(unset)")
-    values, after = done.stdout.splitlines()
+    _version, values, after = done.stdout.splitlines()
     assert values.startswith("'' 0 False 1.5 ") and str(tmp_path) not in values and after == "''", done.stderr
+
+
+def test_processes_of_a_command_do_not_read_them_either(tmp_path):
+    hostile_settings(tmp_path)
+    done = start(python_command("numba", "--sysinfo"), tmp_path)
+    assert done.returncode == 0 and "Threading Layer" in done.stdout and "evil" not in done.stdout, done.stderr
+
+
+def test_settings_that_a_new_release_would_read_are_named(tmp_path):
+    (tmp_path / "newrc").write_text("text.usetex: True\n")
+    code = (
+        "from endoprior.system import surroundings as s; s.NAMES['matplotlib'] = b\"yield 'newrc'\";"
+        "s.set_up_process(); import matplotlib"
+    )
+    done = start([sys.executable, "-P", "-c", code], tmp_path)
+    assert "newrc: expected none in the current folder, which would be read, got one. Fix: `cd`" in done.stderr
+
+
+# A program that imports this one.
+
+
+def test_an_import_changes_nothing_of_its_process(tmp_path):
+    (tmp_path / "matplotlibrc").write_text("lines.linewidth: 7\n")  # the user's own
+    code = """
+import os, signal, sys, threading, warnings
+import cv2, matplotlib, numba, PIL.Image, scipy.sparse, scipy.special, torch  # what these change themselves
+
+def facts():
+    signals = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    numbers = torch.get_num_threads(), cv2.getNumThreads(), numba.config.CACHE_DIR, warnings.filters.copy()
+    streams = sys.stdout, sys.stderr, sys.excepthook, sys.path.copy()
+    parts = [*sys.meta_path], dict(matplotlib.rcParams), threading.enumerate(), signals, dict(os.environ)
+    return *parts, *numbers, *streams, os.getcwd()
+
+before = facts()
+import endoprior
+assert facts() == before
+for name in dir(endoprior):
+    getattr(endoprior, name)
+after = facts()
+assert after == before, [(a, b) for a, b in zip(before, after) if a != b]
+assert matplotlib.rcParams["lines.linewidth"] == 7
+"""
+    done = start([sys.executable, "-P", "-c", code], tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_import_is_quick_and_keeps_the_settings_that_matplotlib_reads_later(tmp_path):
+    (tmp_path / "matplotlibrc").write_text("lines.linewidth: 7\n")
+    heavy = "{'numpy', 'torch', 'numba', 'cv2', 'matplotlib', 'PIL'}"
+    code = (
+        f"import endoprior, sys; assert not {heavy} & sys.modules.keys();"
+        "import matplotlib; print(matplotlib.rcParams['lines.linewidth'])"
+    )
+    done = start([sys.executable, "-P", "-c", code], tmp_path)
+    assert done.stdout == "7.0\n", done.stderr
 
 
 # Streams.

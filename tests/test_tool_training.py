@@ -9,19 +9,20 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save
 
 from endoprior.core.checks import InputError
-from endoprior.tool_masks.network import ToolNetwork, network_from_file
-from endoprior_studies.tool_training import benchmark, composites
+from endoprior.tool_masks.network import InvertedResidual, ToolNetwork
+from endoprior_studies.tool_training import benchmark, camera, composites, footage
 from endoprior_studies.tool_training.benchmark import Counts, TestFrame, count, pictures, score_set
 from endoprior_studies.tool_training.camera import photographed, random_view
 from endoprior_studies.tool_training.composites import IGNORED, SIZE, LabeledFrame, examples
 from endoprior_studies.tool_training.fit import RATE, Examples, fit, loss_of, rate_of
 from endoprior_studies.tool_training.foreign_bodies import gauze, needle, ribbed_tube
-from endoprior_studies.tool_training.instruments import instrument
+from endoprior_studies.tool_training.instruments import NEAR_WIDTH_PX, instrument
 from endoprior_studies.tool_training.noise import fractal_field, smooth_field
-from endoprior_studies.tool_training.tissue import tissue
+from endoprior_studies.tool_training.pretrained import pretrained
+from endoprior_studies.tool_training.scope_tools import cap, catheter, clips
+from endoprior_studies.tool_training.tissue import LIT_PARTS, MATTE_PARTS, tissue
 
 TestFrame.__test__ = False
 
@@ -70,6 +71,61 @@ def test_bodies_are_painted_inside_of_what_they_cover(paint):
         assert body.covered.min() >= 0 and body.covered.max() <= 1 and (body.outline >= body.covered - 1e-6).all()
         shares.append((body.covered > 0.5).mean())
     assert 0.002 < np.median(shares) < 0.5
+
+
+@pytest.mark.parametrize("paint", [cap, catheter, clips])
+def test_what_a_scope_carries_is_painted_where_its_label_is(paint):
+    shares = []
+    for seed in range(12):
+        scene = np.full((*SIZE, 3), (0.6, 0.25, 0.2), np.float32)
+        body, again = (paint(np.random.default_rng(seed), scene, np.ones(SIZE, bool)) for _ in range(2))
+        assert (body.color == again.color).all() and (body.covered == again.covered).all()
+        assert (scene == np.float32([0.6, 0.25, 0.2])).all() and np.isfinite(body.color).all()
+        assert body.covered.min() >= 0 and body.covered.max() <= 1 and (body.outline >= body.covered - 1e-6).all()
+        on_it = body.covered > 0.5
+        if on_it.any():
+            assert np.abs(body.color - scene)[on_it].mean() > 0.02  # it can be seen
+        shares.append(on_it.mean())
+    assert {cap: 0.05, catheter: 0.005, clips: 0.001}[paint] < np.median(shares) < 0.35
+
+
+def test_a_cap_is_a_wall_at_the_border_around_tissue():
+    for seed in range(20):
+        covered = cap(np.random.default_rng(seed), np.zeros((*SIZE, 3), np.float32), np.ones(SIZE, bool)).covered > 0.5
+        inside, walls = (cv2.connectedComponents(part.astype(np.uint8))[0] - 1 for part in (~covered, covered))
+        middle = covered[SIZE[0] // 2 - 8 : SIZE[0] // 2 + 8, SIZE[1] // 2 - 8 : SIZE[1] // 2 + 8]
+        assert not middle.any() and inside == 1 and walls <= 4  # four corners at most
+        rim = np.concatenate([covered[0], covered[-1], covered[:, 0], covered[:, -1]])
+        assert rim.any()
+
+
+def test_shafts_close_to_the_camera_are_wide():
+    near, usual = (
+        np.median([(instrument(np.random.default_rng(s), scene, whole, *w).covered > 0.5).mean() for s in range(12)])
+        for w in ((NEAR_WIDTH_PX,), ())
+        for scene, whole in [(np.zeros((*SIZE, 3), np.float32), np.ones(SIZE, bool))]
+    )
+    assert near > 2 * usual
+
+
+@pytest.mark.parametrize("add", [add for add, _ in (*MATTE_PARTS, *LIT_PARTS)], ids=lambda add: add.__name__)
+def test_parts_of_tissue_change_a_part_of_it(add):
+    scene = np.full((*SIZE, 3), (0.5, 0.2, 0.15), np.float32)
+    made = [add(np.random.default_rng(seed), scene) for seed in range(8)]
+    assert all(image.shape == scene.shape and np.isfinite(image).all() for image in made)
+    changed = [(np.abs(image - scene).max(-1) > 0.02).mean() for image in made]
+    assert 0 < np.mean(changed) < 1 and (scene == np.float32([0.5, 0.2, 0.15])).all()
+
+
+def test_smoke_pales_all_alike_and_hides_nothing_entirely():
+    dark, light = (np.full((*SIZE, 3), level, np.float32) for level in (0.1, 0.9))
+    shares = []
+    for seed in range(20):
+        first, second = (camera.smoked(np.random.default_rng(seed), image) for image in (dark, light))
+        left = (second - first) / 0.8
+        assert left.min() >= 1 - camera.MOST_SMOKE - 1e-5 and left.max() <= 1 + 1e-5
+        shares.append(1 - left.mean())
+    assert max(shares) > 0.5 and min(shares) < 0.3
 
 
 def test_instruments_come_from_the_border():
@@ -149,6 +205,26 @@ def test_the_rate_rises_and_falls():
     assert rates[-1] < RATE / 1000 and all(a >= b for a, b in pairwise(rates[10:]))
 
 
+def test_single_frames_are_read_with_their_masks(tmp_path):
+    for name in ("sisvse_gastrectomy", "cataract1k"):
+        for kind in ("images", "masks"):
+            (tmp_path / "tools_more" / name / kind).mkdir(parents=True)
+        label = np.zeros((200, 300), np.uint8)
+        label[100:110, 50:60] = 255
+        cv2.imwrite(str(tmp_path / "tools_more" / name / "images" / "000.jpg"), np.full((200, 300, 3), 90, np.uint8))
+        cv2.imwrite(str(tmp_path / "tools_more" / name / "masks" / "000.png"), label)
+    (_, _, whole), (_, _, near) = (next(footage.SETS[n](tmp_path)) for n in ("sisvse_gastrectomy", "cataract1k"))
+    assert (whole == (label > 0)).all()
+    assert (near[label > 0] == 1).all() and near[95, 45] == 0 and near[0, 0] == near[105, 200] == IGNORED
+
+
+def test_frames_of_a_small_set_are_not_shown_as_often_as_all_others():
+    few, many = [real_frame(0)], [real_frame(i) for i in range(1, 10)]
+    rng = np.random.default_rng(0)
+    chosen = [composites.any_frame(rng, [few, many]) is few[0] for _ in range(400)]
+    assert 0.19 < np.mean(chosen) < 0.31  # one to the root of nine
+
+
 def test_examples_are_padded_and_ignored_there(monkeypatch):
     monkeypatch.setattr(composites, "SIZE", (150, 190))
     image, label = Examples([], 0, 2)[1]
@@ -186,13 +262,43 @@ def test_training_goes_on_from_given_weights():
     assert all((old == new).all() for old, new in zip(start.parameters(), same.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("content", [None, b"nothing", save({"down.0.0.0.weight": torch.zeros(2)})])
-def test_weights_that_are_none_end_in_one_line(tmp_path, content):
-    file = tmp_path / "weights.safetensors"
-    if content is not None:
+def lite0_of(network):
+    """The weights of a network's way down under the names of EfficientNet-Lite0."""
+    named, norms = {"_conv_stem.weight": network.stem[1].weight[:, :3]}, {"_bn0": network.stem[2]}
+    blocks = [block for block in network.down.modules() if isinstance(block, InvertedResidual)]
+    for k, block in enumerate(blocks):
+        if len(list(block.expand.children())):
+            named[f"_blocks.{k}._expand_conv.weight"] = block.expand[1].weight
+            norms[f"_blocks.{k}._bn0"] = block.expand[2]
+        named[f"_blocks.{k}._depthwise_conv.weight"] = block.filter[1].weight
+        named[f"_blocks.{k}._project_conv.weight"] = block.project[0].weight
+        norms[f"_blocks.{k}._bn1"], norms[f"_blocks.{k}._bn2"] = block.filter[2], block.project[1]
+    for name, norm in norms.items():
+        named |= {f"{name}.{part}": getattr(norm, part) for part in ("weight", "bias", "running_mean", "running_var")}
+    return named
+
+
+def test_a_training_starts_from_the_way_down_of_a_file(tmp_path):
+    file = tmp_path / "lite0.pth"
+    weights = {name: torch.full_like(each, k) for k, (name, each) in enumerate(lite0_of(ToolNetwork()).items())}
+    torch.save(weights, file)
+    network = pretrained(file, 0)
+    copied = lite0_of(network)
+    assert copied.keys() == weights.keys() and all((copied[name] == weights[name]).all() for name in weights)
+    assert not network.stem[1].weight[:, 3:].any()
+    same = pretrained(file, 0).up[0][1].weight
+    assert (same == network.up[0][1].weight).all() and (same != pretrained(file, 1).up[0][1].weight).any()
+
+
+@pytest.mark.parametrize("content", [None, b"nothing", {"_conv_stem.weight": torch.zeros(2)}, [1, 2]])
+def test_a_file_of_something_else_ends_in_one_line(tmp_path, content):
+    file = tmp_path / "weights.pth"
+    if isinstance(content, bytes):
         file.write_bytes(content)
-    with pytest.raises(InputError, match="weights") as error:
-        network_from_file(file)
+    elif content is not None:
+        torch.save(content, file)
+    with pytest.raises(InputError, match="EfficientNet-Lite0") as error:
+        pretrained(file, 0)
     assert "\n" not in str(error.value)
 
 

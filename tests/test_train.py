@@ -13,13 +13,15 @@ import pytest
 import torch
 from tiny_training import KINDS, losses_of, tiny_config
 
+import endoprior
 from endoprior.compute.morton import morton_order
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
+from endoprior.evaluation.scoring import evaluate, scored_data
 from endoprior.export import export
 from endoprior.export.formats import ExportOptions
-from endoprior.model.presets import preset
+from endoprior.model.presets import PRESETS, preset
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
@@ -105,11 +107,35 @@ def test_resume_refuses_another_config_or_other_data(make_tiny_sequence, tmp_pat
 
 def test_a_sequence_read_in_another_way_than_the_config_says_is_refused(tiny_sequence):
     cfg = replace(tiny_config("basis", 1, 1), data=DataConfig(lift_missing_depth=True))
-    with pytest.raises(InputError, match=r"data\.lift_missing_depth: expected True, got a .* False\. Fix: `load"):
-        train(load_sequence(tiny_sequence), cfg)
     with pytest.raises(InputError, match=r"data\.shrink: expected 1, got a sequence that was read with 2"):
         train(load_sequence(tiny_sequence, DataConfig(shrink=2)), tiny_config("basis"))
+    for changed in (load_sequence(tiny_sequence).part(0, 5), load_sequence(tiny_sequence).without_masks()):
+        with pytest.raises(InputError, match=r"data\.lift_missing_depth: expected True, got a .* False\. Fix: `load"):
+            train(changed, cfg)
     assert len(train(load_sequence(tiny_sequence, replace(cfg.data, format="endonerf")), cfg))
+
+
+def test_a_sequence_that_was_opened_without_a_config_is_read_as_the_preset_has_it(tiny_sequence):
+    cfg = replace(tiny_config("basis", 1, 1), data=DataConfig(lift_missing_depth=True, shrink=2, first_frames=6))
+    opened = load_sequence(tiny_sequence)
+    scene, want = train(opened, cfg), train(load_sequence(tiny_sequence, cfg.data), cfg)
+    assert len(scene.cameras) == 6 and scene.cameras[0].width == opened.camera(0).width // 2
+    assert torch.equal(scene.at(0.5).means, want.at(0.5).means)
+    scored = evaluate(scene, opened, networks=False, speed=False)
+    again = evaluate(scene, load_sequence(tiny_sequence, scored_data(cfg.data)), networks=False, speed=False)
+    assert scored.scores == again.scores and scored.protocol["shrink"] == 2 and "psnr" in scored.scores
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRESETS.names())
+def test_the_flow_of_the_readme_works_for_every_preset(name, tiny_sequence):
+    sequence = endoprior.load_sequence(tiny_sequence)
+    cfg = endoprior.preset(name, iterations=2)
+    if name.startswith(("endonerf", "endosurf")):
+        cfg = replace(cfg, radiance=replace(cfg.radiance, rays=6, even_samples=5, more_samples=5))
+    scene = endoprior.train(sequence, cfg)
+    assert scene.render(0.5).color.shape == (40, 48, 3)
+    assert "psnr" in endoprior.evaluate(scene, sequence, networks=False, speed=False).scores
 
 
 @pytest.mark.parametrize(

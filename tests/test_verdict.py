@@ -159,12 +159,35 @@ def test_what_nothing_confirms_is_not_good():
     assert verdict.word == "usable" and "too few points" in verdict.reasons[0]
 
 
+SLIDES = ", but its tissue may not move as the real one does"
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts", "plain"),
+    [
+        ({}, Facts(), "Good to look at; it can be measured"),
+        ({}, Facts(lengths_are_relative=True), "Good to look at; do not measure: lengths are not millimeters"),
+        ({}, Facts(motion_is_unknown=True), f"Good to look at{SLIDES}; do not measure"),
+        ({"slip_px": 12.6}, Facts(), f"Good to look at{SLIDES}; do not measure"),
+        ({"slip_px": 6.0}, Facts(), "Good to look at; measure with care"),
+        ({}, Facts(share_used=0.7), "Good enough to look at; measure with care"),
+        ({}, Facts(share_with_missed_tools=0.17), "Look at it only beside the video; do not measure"),
+        ({"psnr_tissue": 20.0, "gain_over_mean": 0.5}, Facts(lengths_are_relative=True), "Wrong: do not use it"),
+    ],
+)
+def test_plain_words_say_what_a_model_is_good_for(changes, facts, plain):
+    assert verdict_on(GOOD_SCORES | changes, facts).plain == plain
+
+
 def test_without_a_held_out_frame_nothing_is_good():
     assert verdict_on({}, Facts()).word == "doubtful"
 
 
 def test_what_is_wrong_is_not_called_done(tmp_path):
     wrong, good = Verdict("wrong", ("worse",)), Verdict("good", ("33 dB",))
+    measured = Verdict("good", ("33 dB",), "Good to look at; it can be measured")
+    plain, done, figures = last_words(measured, "2 min", tmp_path).splitlines()
+    assert plain == f"{measured.plain}." and done.startswith("Done") and figures == "Verdict: good: 33 dB."
     assert "Done" not in last_words(wrong, "2 min", tmp_path) and "wrong: worse" in last_words(wrong, "2 min", tmp_path)
     assert last_words(good, "2 min", tmp_path).startswith("Done in 2 min.")
     assert last_words(None, "2 min", tmp_path).startswith("Done in 2 min.")

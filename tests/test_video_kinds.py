@@ -44,6 +44,48 @@ def test_an_impossible_pixel_aspect_is_ignored_and_said(tmp_path):
     assert source.width == 96 and source.notes == [said]
 
 
+def test_high_dynamic_range_that_only_the_images_tell_is_said(tmp_path):
+    """Some programs write the levels into the images, and "unknown" into the container."""
+    colors = "colorprim=bt2020:transfer=smpte2084:colormatrix=bt2020nc"
+    encoder = ["-vf", "setparams=colorspace=bt2020nc", "-c:v", "libx264", "-pix_fmt", "yuv420p10le"]
+    encoder += ["-x264-params", colors]
+    notes = open_source(ffmpeg("-i", encode(tmp_path / "a.mp4", smooth(4)), *encoder, tmp_path / "h.mkv")).notes
+    assert len(notes) == 1 and notes[0].startswith("h.mkv: HDR video (PQ) is read as ordinary video")
+
+
+@pytest.mark.parametrize(("transfer", "name"), [("smpte2084", "PQ"), ("arib-std-b67", "HLG"), ("bt709", "")])
+@pytest.mark.parametrize("ending", ["mp4", "mkv", "ts"])
+def test_video_of_high_dynamic_range_is_said(tmp_path, transfer, name, ending):
+    colors = f"setparams=color_trc={transfer}:color_primaries=bt2020:colorspace=bt2020nc"
+    encoder = ["-c:v", "libx264", "-pix_fmt", "yuv420p10le"]
+    video = ffmpeg("-i", encode(tmp_path / "a.mp4", smooth(4)), "-vf", colors, *encoder, tmp_path / f"h.{ending}")
+    notes = open_source(video).notes
+    assert len(notes) == bool(name)
+    for note in notes:
+        assert note.startswith(f"h.{ending}: HDR video ({name}) is read as ordinary video")
+        words = shlex.split(note.split("`")[1])
+        assert words[0] == "ffmpeg"
+        usual = open_source(ffmpeg(*words[1:]))
+        assert len(list(usual)) == 4 and usual.notes == []
+
+
+@pytest.mark.parametrize("turned", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirrored", [(), ("hflip",), ("vflip",), ("hflip", "vflip")])
+def test_images_are_mirrored_and_turned_as_players_show_them(tmp_path, turned, mirrored):
+    stored = encode(tmp_path / "stored.mp4", smooth(4))
+    options = ["-display_rotation", str(turned), *(f"-display_{each}" for each in mirrored)]
+    video = ffmpeg(*options, "-i", stored, "-c", "copy", tmp_path / "shown.mp4")
+    want = list(open_source(ffmpeg("-i", video, "-c:v", "ffv1", "-pix_fmt", "bgr0", tmp_path / "want.mkv")))
+    source = open_source(video)
+    found = list(source)
+    assert (source.width, source.height) == ((64, 96) if turned in (90, 270) else (96, 64))
+    assert lowest_psnr(found, [image.rgb_u8 for image in want]) > 40
+    said = "shown.mp4: 4 images are stored mirrored; they are used as the file says that they are shown"
+    assert source.notes == ([said] if len(mirrored) == 1 else [])
+    small = [image(source.width, source.height) for _, image in source.quick_images()]
+    assert psnr(small[0], want[0].rgb_u8) > 30
+
+
 @pytest.mark.parametrize("first", ["tff", "bff"])
 def test_interlaced_images_are_not_combed(tmp_path, first):
     fields = [cv2.GaussianBlur(image, (0, 0), 2) for image in smooth(24, step=3)]
@@ -158,6 +200,32 @@ def test_a_pause_keeps_the_frame_rate_and_all_images(tmp_path):
     assert [image.seconds for image in source] == pytest.approx(np.array(times) / 25)
 
 
+@pytest.mark.parametrize(
+    ("stamps", "repeated"),
+    [
+        ([80 * (i // 2) for i in range(20)], 10),
+        ([120 * (i // 3) for i in range(20)], 13),
+        ([40 * (i - (i % 5 == 4)) for i in range(20)], 4),
+        ([40 * i for i in range(18)] + [40 * 17] * 2, 2),
+    ],
+)
+def test_time_stamps_that_repeat_are_no_parts(tmp_path, stamps, repeated):
+    images, base = smooth(20), Fraction(1, 1000)
+    with av.open(str(tmp_path / "r.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 64, 96, "bgr0"
+        for image, stamp in zip(images, stamps, strict=True):
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+                packet.pts = packet.dts = stamp
+                packet.time_base, packet.stream = base, stream
+                container.mux(packet)
+    source = open_source(tmp_path / "r.mkv")
+    found = list(source)
+    assert lowest_psnr(found, images) > 25 and source.frames_per_second == pytest.approx(25)
+    assert [image.seconds for image in found] == pytest.approx(np.arange(20) / 25) == source.times
+    assert source.notes == [f"r.mkv: {repeated} time stamps repeat the one before; such images are spread in time"]
+
+
 def test_times_only_increase_but_for_single_ones_in_disorder():
     def along(times):
         line = Timeline(1.0)
@@ -166,15 +234,22 @@ def test_times_only_increase_but_for_single_ones_in_disorder():
     assert along([0, 1, 2, 3]) == ([0, 1, 2, 3], 0, 0)
     assert along([7, 8, 0, 1, 2, 0, 1]) == ([7, 8, 9, 10, 11, 12, 13], 2, 0)
     assert along([0, 1, 5, 2, 6]) == ([0, 1, 5, 2, 6], 0, 1)
-    assert along([0, 1, 1, 2]) == ([0, 1, 1, 2], 0, 1)
+    assert along([0, 1, 2, 1.5, 3]) == ([0, 1, 2, 1.5, 3], 0, 1)
     assert along([None, None, None]) == ([0, 1, 2], 0, 0)
-    assert along([0, 0, 0]) == ([0, 1, 2], 2, 0)
+    assert along([0, 0, 0]) == ([0, 1, 2], 0, 0)
+    assert along([0, 1, 1, 2]) == ([0, 1, 1.5, 2], 0, 0)
+    assert along([0, 1, 1, 0, 0, 1]) == ([0, 1, 2, 3, 3.5, 4], 1, 0)
+    assert along([0] * 40 + [40, 41]) == (list(range(42)), 0, 0)  # more than are held in memory
+    assert along([0] * 40 + [20, 21]) == (list(range(42)), 0, 0)
+    assert along([0, 0, 100, 101]) == ([0, 1, 100, 101], 0, 0)  # a pause
 
 
 def test_the_usual_rate_is_that_of_most_steps():
     assert usual_rate(np.arange(9) / 25, [12.0]) == pytest.approx(25)
     assert usual_rate(np.round(np.arange(90) / 30 * 1.001, 3), [30000 / 1001]) == 30000 / 1001  # a file counts ms
     assert usual_rate([0, 0.04, 9.0, 9.04, 0.0, 0.04], [0.5]) == pytest.approx(25)
+    assert usual_rate([0.0, 0.0, 0.08, 0.08, 0.16, 0.16, 0.24], [12.5]) == pytest.approx(25)
+    assert usual_rate([0.0, 0.04, 0.08, 0.08, 0.16, 0.2], []) == pytest.approx(25)
     assert usual_rate([], [600.0]) == 600 and usual_rate([], []) == usual_rate([0.0], [1e9]) == 25
 
 
@@ -270,6 +345,23 @@ def test_an_animated_webp_is_a_video(tmp_path):
     assert all(np.array_equal(image.rgb_u8, want) for image, want in zip(found, images, strict=True))
     assert [image.seconds for image in found] == pytest.approx([0, 0.04, 0.08, 0.28, 0.32, 0.36])
     assert source.frames_per_second == pytest.approx(25)
+
+
+@pytest.mark.parametrize("name", ["a.mov", "a.webp", "a.gif"])
+def test_transparent_parts_of_videos_are_said(tmp_path, name):
+    images = [np.dstack([image, np.full(image.shape[:2], 255, np.uint8)]) for image in smooth(4)]
+    for image in images[:3]:
+        image[:20, :20, 3] = 0
+    first, *others = map(Image.fromarray, images)
+    if name == "a.mov":
+        for index, image in enumerate(images):
+            Image.fromarray(image).save(tmp_path / f"{index}.png")
+        ffmpeg("-i", tmp_path / "%d.png", "-c:v", "png", "-pix_fmt", "rgba", tmp_path / name)
+    else:
+        first.save(tmp_path / name, save_all=True, append_images=others, lossless=True, duration=40, disposal=2)
+    source = open_source(tmp_path / name)
+    assert len(list(source)) == 4
+    assert f"{name}: 3 images have transparent parts; their color is used there, whatever it is" in source.notes
 
 
 def test_what_is_no_video_is_named(tmp_path):

@@ -14,8 +14,17 @@ from view_client import Client, at_work
 from websockets.exceptions import InvalidStatus
 from websockets.sync.server import serve
 
+from endoprior.cli import main
 from endoprior.core.checks import InputError
-from endoprior.view.access_control import RateLimit, access_control, check_address, is_known_host, is_open
+from endoprior.view.access_control import (
+    RateLimit,
+    access_control,
+    check_address,
+    is_known_host,
+    is_open,
+    names_of_machine,
+)
+from endoprior.view.panel import IMAGE
 from endoprior.view.server import Viewer
 from endoprior.view.viewable_scene import ViewableScene
 
@@ -92,6 +101,48 @@ def test_every_spelling_of_an_address_has_the_same_rules(bound):
         viewer.close()
 
 
+def test_names_of_this_machine_are_known(monkeypatch):
+    names_of_machine.cache_clear()
+    monkeypatch.setattr(socket, "gethostname", lambda: "Box")
+    monkeypatch.setattr(socket, "getfqdn", lambda: "box.lab.example")
+    monkeypatch.setattr(socket, "gethostbyaddr", lambda _name: ("box.lab.example", ["gpu.lab.example"], []))
+    for name in ("box", "BOX.lab.example:80", "box.lab.example.", "gpu.lab.example", "box.local:8080"):
+        assert is_known_host(name, "0.0.0.0"), name
+    for name in (*STRANGE, "lab.example", "box.evil.example", "xbox.lab.example", "box.lab.example.evil.example"):
+        assert not is_known_host(name, "0.0.0.0"), name
+    names_of_machine.cache_clear()
+
+
+def test_the_full_name_of_this_machine_shows_the_page(viewer):
+    assert ask(viewer.url, host=f"{socket.getfqdn()}:{viewer.port}")[0] == 200
+
+
+def test_names_that_the_user_allows_are_known(tmp_path):
+    viewer = Viewer(ViewableScene(moving_scene(), "wall"), names=("viewer.lab.example", "Other.example"))
+    try:
+        assert ask(viewer.url, host="evil.example")[0] == 403
+        for name in ("viewer.lab.example", "VIEWER.lab.example.", "other.example:443"):
+            assert ask(viewer.url, host=name)[0] == 200 and ask(viewer.url, "/", host=name)[0] == 403
+        status, _, body = ask(viewer.url, host="sub.viewer.lab.example")
+        assert status == 403 and b"`endoprior view RUN --allow-host NAME`" in body
+    finally:
+        viewer.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [
+        ("https://viewer.example/x", "viewer.example"), ("viewer.example:80", "viewer.example"), ("*", "NAME"),
+        ("*.lab.example", "NAME"), ("a b", "NAME"), ("höst", "NAME"), ("-x", "NAME"), ("[::1", "NAME"),
+    ],
+)  # fmt: skip
+def test_what_is_no_name_of_a_host_is_not_allowed(name, fix, tmp_path, capsys):
+    assert main(["view", str(tmp_path), f"--allow-host={name}"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("endoprior: --allow-host: expected the name of a host, such as viewer.example.org, got ")
+    assert said.endswith(f"Fix: `--allow-host {fix}`.\n")
+
+
 def test_the_name_given_as_host_is_known():
     assert is_known_host("server.example:8080", "Server.example") and not is_known_host("server.example", "127.0.0.1")
 
@@ -132,7 +183,7 @@ def test_at_most_one_file_of_a_kind_is_written_in_a_second(viewer):
     client.image(quiet=0.1)
     began = time.monotonic()
     while time.monotonic() - began < 1.5:
-        client.set(viewer.panel.screenshot, True)
+        client.set(viewer.panel.save_view, IMAGE)
         time.sleep(0.005)
     time.sleep(0.3)
     written = len(list(viewer.out.iterdir()))

@@ -19,7 +19,7 @@ from endoprior.data import load_sequence
 from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.train import train
-from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT
+from endoprior.view.panel import BROWSER, CLEAR, IMAGE, LAYER_NAMES, MESH, ORBIT, PLY, SLICER, TABLE, VIDEO
 from endoprior.view.server import Viewer
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport
@@ -62,9 +62,9 @@ def viewer(scene, phantom, tmp_path):
 
 
 @contextmanager
-def opened(viewer):
+def opened(viewer, width=WIDTH, height=HEIGHT):
     """The page, once it shows an image."""
-    with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
+    with open_page(viewer.url, width=width, height=height) as page:
         page.wait_for("document.querySelector('[role=slider]') !== null")
         wait_until(lambda: canvas(page).std() > 20, 30)
         yield page
@@ -156,7 +156,7 @@ def test_two_clicks_measure_the_true_distance(viewer, page, phantom):
         true = float(np.linalg.norm(points[1] - points[0]))
         assert viewer.measuring.measured.curve("Distance")[FRAME] == pytest.approx(true, abs=1.0)
         distance = viewer.measuring.measured.curve("Distance")[FRAME]
-        page.wait_for(f"document.body.innerText.includes('{distance:.2f} mm')")
+        page.wait_for(f"document.body.innerText.includes('{distance:.2f} ± ')")
     settled(page, "measured")
 
 
@@ -241,3 +241,49 @@ def test_masks_are_painted_by_dragging_carried_and_saved(phantom, tmp_path):
         settled(page, "mask_saved")
         assert np.array_equal(~load_sequence(folder).frame(1).tissue_mask, viewable.mask_edits.tool(1))
         assert not unexpected(page.problems, DRAG_NOTE)
+
+
+def buttons(page) -> dict[str, tuple[float, float]]:
+    """Top and bottom of each visible button, by its label."""
+    found = page.evaluate(
+        "[...document.querySelectorAll('button')].filter(b => b.offsetHeight && b.innerText.trim())"
+        ".map(b => [b.innerText.trim(), b.getBoundingClientRect()]).map(([name, b]) => [name, [b.top, b.bottom]])"
+    )
+    return dict(found)
+
+
+def test_measure_and_save_need_no_scrolling(viewer):
+    with opened(viewer, 1280, 720) as page:
+        ends = buttons(page)
+        names = (CLEAR, TABLE, IMAGE, VIDEO, PLY, SLICER, MESH)
+        for name in names:
+            assert 0 < ends[name][0] < ends[name][1] < 720
+        page.screenshot(PICTURES / "panel_1280x720.png")
+        choose(viewer, viewer.panel.measure, True)
+        settled(page)
+        for x in (400, 600):
+            before = viewer.measuring.measured
+            page.click_at(x, 400)
+            wait_until(lambda before=before: viewer.measuring.measured is not before)
+        wait_until(lambda: viewer.panel.chart.visible)
+        page.wait_for("document.querySelector('.uplot') !== null")
+        settled(page)
+        ends = buttons(page)
+        page.screenshot(PICTURES / "panel_measuring_1280x720.png")
+        assert all(0 < ends[name][0] < ends[name][1] < 720 for name in names)
+
+
+def test_the_panel_of_a_narrow_window_is_below_the_image(viewer):
+    for size in ((560, 800), (390, 844)):
+        with opened(viewer, *size) as page:
+            page.wait_for(f"document.querySelector('canvas').getBoundingClientRect().height < {0.6 * size[1]}")
+            (left, top, width, height), below = page.box("canvas"), page.box("[role=slider]")[1]
+            assert (left, top, width) == (0, 0, size[0]) and height >= 0.44 * size[1] and below >= height
+            # The image keeps its form: the phantom's is 192 x 160 px.
+            time.sleep(2)
+            shown = page.screenshot(PICTURES / f"panel_{size[0]}x{size[1]}.png")[: int(height)].astype(float)
+            lit = shown.sum(-1) > 40
+            lit[:, : size[0] // 2] = False  # viser's note about software WebGL
+            rows = np.flatnonzero(lit.any(1))
+            scale = min(size[0] / 192, height / 160)
+            assert rows[-1] - rows[0] == pytest.approx(160 * scale, abs=0.05 * height)

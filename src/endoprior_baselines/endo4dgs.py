@@ -26,7 +26,7 @@ from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate, rate_of
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of

@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, huber_loss, relu
 from typing_extensions import override
 
-from endoprior.compute.relu_network import relu_network
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.gaussians import Gaussians
@@ -31,10 +30,11 @@ from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
+from .relu_network import relu_network
 from .surface_points import Released
 
 UNIT_MM = 10.0

@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
+from endoprior.compute.parallel_kernels import parallel_njit
 from endoprior.compute.simd import (
     LANES,
     fma,
@@ -143,7 +144,7 @@ def _value(weights, centers, widths, time, place, lanes, held, slot):
         store(held, slot, splat(_ZERO))
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _value_at(weights, centers, widths, bases, time, out):
     # One task per chunk of blocks; writes out (N, C).
     num, channels = out.shape
@@ -207,7 +208,7 @@ def _step(
     _adam(s, s1, s2, place, lanes, width, v_width, rate, root_scale, beta1, beta2, epsilon)
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _adam_step(
     w, c, s, w1, c1, s1, w2, c2, s2, bases, times, v_values, rate, root_scale, beta1, beta2, epsilon
 ):  # fmt: skip

@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from endoprior.compute.fastmath import REORDERED
+from endoprior.compute.parallel_kernels import parallel_njit
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 
@@ -110,7 +111,7 @@ def _second_difference(plane: Tensor) -> Tensor:
     return plane[:-2] - 2 * plane[1:-1] + plane[2:]
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _sums(plane, squares, distance):
     # One task per row; writes its entry of both.
     rows, width = plane.shape
@@ -126,7 +127,7 @@ def _sums(plane, squares, distance):
         squares[r], distance[r] = square, away
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _add_rows(plane, gradient, factor, pull):
     # One task per row. The second differences that contain a row are those at the row before, itself and the next;
     # the rows that these read have weights 1, -4, 6, -4, 1 where all three are there.

@@ -21,7 +21,6 @@ from torch.nn.functional import conv2d, normalize
 from typing_extensions import override
 
 from endoprior.compute.neighbors import nearest
-from endoprior.compute.relu_network import relu_network
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Frame, Splats
@@ -36,10 +35,11 @@ from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_linear, rate_of
-from endoprior.training.step import Drawn
+from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 from .radiance.layers import encoded, encoded_size
+from .relu_network import relu_network
 from .surface_points import Released, grid_points
 
 PLACE_BANDS, TIME_BANDS = 10, 4

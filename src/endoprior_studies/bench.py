@@ -68,6 +68,9 @@ def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
     if argv[:1] == ["masks"]:
         return bench_masks.run(argv[1:])
+    if page := _page(argv):
+        say(page)
+        return 0
     args = parse(Bench, argv, "bench")
     from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
@@ -113,6 +116,17 @@ def run(argv: list[str]) -> int:
     if source.is_dir() and reports:
         say(f"overview: {write_overview(reports, args.out)}")
     return 1 if any(matrix.failed for matrix in reports.values()) else 0
+
+
+def _page(argv: list[str]) -> str:
+    """The help page of the spec that is named before `--help`; empty if none is."""
+    first, *rest = argv or [""]
+    if first.startswith("-") or not {"-h", "--help"} & {*rest}:
+        return ""
+    from .spec_file import find_spec
+    from .spec_page import spec_page
+
+    return spec_page(first, find_spec(first))
 
 
 def _checked(args: Bench) -> dict[str, Path]:

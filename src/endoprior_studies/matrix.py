@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from endoprior.core.checks import InputError, input_error
 from endoprior.core.config_io import to_dict
-from endoprior.data.files import read_json
+from endoprior.data.files import read_parts
+from endoprior.evaluation.context import read_frame_scores, read_scores
 from endoprior.evaluation.pictures import fingerprint
 from endoprior.evaluation.true_masks import SCORES_FILE
 from endoprior.runs.log import Growth, growth_of
@@ -29,7 +30,7 @@ from .execute import Executor
 from .matched_count import Place, Search, search_thresholds
 from .method import origin_of
 from .spec import Cell, Spec, cells, sequence_folder
-from .worker import Job, finished
+from .worker import REPEAT, Job, finished
 
 if TYPE_CHECKING:
     from endoprior.data import FrameSequence
@@ -140,7 +141,8 @@ class _Runner:
                     copy = changed_copy(sequence.path, chosen, folder, SCORES_VERSION, say, write=write)
                     self.trained_on[name] = copy.path
                     self.known[name] += [copy.fingerprint()]
-                    self.known[name] += [read_json(copy.path / SCORES_FILE)["scores"]] if "masks" in found else []
+                    if "masks" in found:
+                        self.known[name].append(read_scores(copy.path / SCORES_FILE, REPEAT)["scores"])
                 matrix.data[name] = sequence.path
                 matrix.extents[name] = len(sequence), sequence.camera(0).width, sequence.camera(0).height
                 matrix.relative |= {name} if sequence.depth_is_relative else set()
@@ -281,20 +283,21 @@ def open_sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequenc
 def commits_of(matrix: Matrix) -> list[str]:
     """Commits at which the finished cells of presets were trained, sorted; "unknown" outside a checkout."""
     records = [folder / "run" / "config.json" for folder in matrix.done.values()]
-    commits = {read_json(record).get("commit") for record in records if record.exists()}
+    parts = {"commit": str | None}
+    commits = {read_parts(record, parts, REPEAT)["commit"] for record in records if record.exists()}
     return sorted(commit or "unknown" for commit in commits)
 
 
 def frames_of(folder: Path) -> dict[str, dict[int, float]]:
     """Values of single test frames of a finished cell, by score and index of the frame."""
     file, found = folder / "per_frame.json", {}
-    for row in json.loads(file.read_text(encoding="utf-8")) if file.exists() else []:
+    for row in read_frame_scores(file) if file.exists() else ():
         for score, value in row.items():
             if score not in ("index", "time"):
-                found.setdefault(score, {})[row["index"]] = value
+                found.setdefault(score, {})[int(row["index"])] = value
     return found
 
 
 def scores_of(folder: Path) -> dict[str, Any]:
     """`scores`, `skipped` and `protocol` of a finished cell."""
-    return read_json(folder / "metrics.json")
+    return read_scores(folder / "metrics.json")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from endoprior.core.checks import InputError, input_error
+from endoprior.core.checks import InputError, input_error, or_did_you_mean
 from endoprior.core.config_io import from_dict
 from endoprior.data.formats import REGISTRY as LAYOUTS
 from endoprior.data.reading import load_yaml, read_text
@@ -29,6 +29,8 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 MOST_EXTENDED = 8
 FOLDER = Path(__file__).parent / "specs"
 """Specs that come with the program. `endoprior bench` takes them by name: `quick`, `sized`, `sized/growth`."""
+MISSING = "install the package with this plugin; `endoprior plugins` lists what is installed."
+"""What to do about a name that no installed package has."""
 READERS: dict[str, Callable[[str], Any]] = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
 MOST_CELLS = 100_000
 
@@ -53,7 +55,8 @@ def find_spec(name_or_path: str) -> Path:
         folder = FOLDER / name_or_path
         return folder if folder.is_dir() else folder.with_suffix(".yaml")
     if not Path(name_or_path).exists():
-        raise input_error(name_or_path, f"a file, a folder or one of {', '.join(names)}", "neither", "correct SPEC.")
+        fix = or_did_you_mean("correct SPEC.", name_or_path, names)
+        raise input_error(name_or_path, f"a file, a folder or one of {', '.join(names)}", "neither", fix)
     return Path(name_or_path)
 
 
@@ -169,7 +172,15 @@ def _demand(sound: object, where: str, expected: str, got: str, fix: str) -> Non
 
 def _demand_one_of(where: str, name: str, choice: Iterable[str], fix: str = "choose one.") -> None:
     known = [*choice]
+    fix = or_did_you_mean(fix, name, known)
     _demand(name in known, where, f"one of {', '.join(known) or 'none'}", f"{name!r}", fix)
+
+
+def _demand_plugin(where: str, name: str, installed: Sequence[str]) -> None:
+    """As `_demand_one_of`, for names that packages add: one is misspelled, or its package is missing."""
+    got = f"{name!r}, which no installed package has"
+    fix = or_did_you_mean(MISSING, name, installed)
+    _demand(name in installed, where, f"one of {', '.join(installed)}", got, fix)
 
 
 def _check(spec: Spec) -> None:
@@ -187,9 +198,10 @@ def _check(spec: Spec) -> None:
     for name in (spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))):
         _demand_one_of("claims, compare_with", name, spec.methods)
     for name in (*spec.scores, *(claim.score for claim in spec.claims)):
-        _demand(name in all_scores(), "scores, claims", "names of scores", f"{name!r}", "see docs/scores.md.")
+        fix = f"see docs/scores.md, or {MISSING}"
+        _demand(name in all_scores(), "scores, claims", "names of scores", f"{name!r}", fix)
     for name in spec.protocols:
-        _demand_one_of("protocols", name, PROTOCOLS.names())
+        _demand_plugin("protocols", name, PROTOCOLS.names())
     _check_cells(spec)
 
 
@@ -255,7 +267,7 @@ def _check_method(spec: Spec, where: str, method: MethodSpec, known: list[str]) 
     _demand(sum(map(bool, kinds)) <= 1, where, "one of preset, method and pictures", "several", "keep one.")
     for key, name, choice in (("preset", method.preset, preset_names()), ("method", method.method, known)):
         if name:
-            _demand_one_of(f"{where}.{key}", name, choice)
+            _demand_plugin(f"{where}.{key}", name, choice)
     alone = not method.pictures and (method.depth_pictures or method.depth_scale)
     _demand(not alone, where, "depth_pictures and depth_scale beside pictures", "no pictures", "add pictures.")
     for key, folders in (("pictures", method.pictures), ("depth_pictures", method.depth_pictures)):

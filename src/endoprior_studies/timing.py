@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from endoprior.core.config import Config
-from endoprior.data.files import read_json
+from endoprior.data.files import read_own, read_parts
 from endoprior.runs.folder import LOG, SCENE
 from endoprior.runs.log import LOG_EVERY, read_log
 from endoprior.system.atomic import write_json
 
 from .matrix import Matrix, run_matrix
 from .spec import Cell, Spec
-from .worker import DONE
+from .worker import DONE, REPEAT
 
 MEASURED = 3 * LOG_EVERY
 """Iterations of a part of the schedule; the first `LOG_EVERY` do not count."""
@@ -58,7 +58,7 @@ def shortened(cfg: Config) -> dict[str, Any]:
 class Speed:
     """What one method costs on frames of one size."""
 
-    iteration: list[float]
+    iteration: tuple[float, ...]
     """Seconds of an iteration in each part."""
     windows: int
     """Trainings of a cell: a moving camera has several windows."""
@@ -75,7 +75,7 @@ class Speed:
             parts: of the measured schedule.
         """
         if (known := folder / SPEED).exists():
-            return Speed(**read_json(known))
+            return read_own(known, Speed, REPEAT)
         lines = read_log(folder / "run" / LOG, "stage", "iteration", "seconds")
         windows = 1 + max((line.get("window", 0) for line in lines), default=0)
         means, begins = [], (0, 0, parts[1], parts[1] + parts[2])
@@ -87,9 +87,9 @@ class Speed:
             ]
             means.append(sum(inside) / len(inside) if inside else 0.0)
         trained = windows * sum(part * mean for part, mean in zip(parts, means, strict=True))
-        beside = max(read_json(folder / DONE)["seconds"] - trained, 0.0) / frames
+        beside = max(read_parts(folder / DONE, {"seconds": float}, REPEAT)["seconds"] - trained, 0.0) / frames
         size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-        speed = Speed(means, windows, beside, size)
+        speed = Speed(tuple(means), windows, beside, size)
         write_json(known, asdict(speed))
         for scene in folder.rglob(SCENE):
             scene.unlink()

@@ -6,7 +6,6 @@ resumes from its checkpoint.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sys
@@ -17,10 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from endoprior.core.checks import InputError
-from endoprior.data.files import read_json
+from endoprior.data.description import read_description
+from endoprior.data.files import read_own, read_parts
 from endoprior.system.atomic import write_json, write_text
 from endoprior.system.console import complain
 
+REPEAT = "remove it, and repeat the command."
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
 FOUND = "methods train with masks found from the footage; scores of these masks: all frames, full size, against masks/"
@@ -65,9 +66,11 @@ class Job:
 
 def finished(folder: Path, key: str) -> bool:
     """Whether `folder` holds a finished cell with this `key` and readable scores."""
+    from endoprior.evaluation.context import read_scores
+
     try:
-        scores = read_json(folder / "metrics.json").get("scores")
-        return read_json(folder / DONE).get("key") == key and isinstance(scores, dict)
+        read_scores(folder / "metrics.json")
+        return read_parts(folder / DONE, {"key": str, "seconds": float}, REPEAT)["key"] == key
     except InputError:
         return False
 
@@ -82,6 +85,7 @@ def work(job: Job) -> None:
     from endoprior.core.config_io import from_dict
     from endoprior.core.geometry import camera_to_world
     from endoprior.data import load_sequence
+    from endoprior.evaluation.context import read_scores
     from endoprior.evaluation.scoring import evaluate, scored_data
     from endoprior.evaluation.true_masks import SCORES_FILE
     from endoprior.model.scene import RenderedScene
@@ -103,14 +107,14 @@ def work(job: Job) -> None:
     sequence = load_sequence(job.scored_on, scored_data(reading))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
     given_path = camera_to_world(map(sequence.camera, range(len(sequence)))) if "poses" in job.found_parts else None
-    networks = {"networks": job.networks, "weights_dir": weights_dir}
+    networks = {"networks": job.networks, "download": True, "weights_dir": weights_dir}
     asked = {"reading": reading, "given_path": given_path, "protocols": job.protocols}
     result = evaluate(found, sequence, **networks, **asked)
     if "poses" in job.found_parts:
-        source = read_json(Path(job.data) / "sequence.json")["sources"]["poses"]
+        source = read_description(Path(job.data) / "sequence.json").get("sources", {}).get("poses", "unknown")
         result.protocol["poses: estimated"] = f"{ESTIMATED}; found: {source}"
     if "masks" in job.found_parts:
-        of_masks = read_json(Path(job.data) / SCORES_FILE)
+        of_masks = read_scores(Path(job.data) / SCORES_FILE, REPEAT)
         result.scores |= of_masks["scores"]
         result.skipped |= of_masks["skipped"]
         result.protocol["masks: found"] = FOUND
@@ -134,10 +138,9 @@ def work(job: Job) -> None:
 
 def main(argv: list[str]) -> int:
     """Work on the job file `argv[0]`; exit status as for the command line."""
-    job = Job(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     try:
-        work(job)
+        work(read_own(Path(argv[0]), Job, REPEAT))
     except InputError as error:
         complain(f"endoprior: {' '.join(str(error).split())}")
         return 2

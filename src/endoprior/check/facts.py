@@ -6,8 +6,7 @@ Shared letters: `T` frames, `H, W` image size. Cheap measurements cover every fr
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,37 +16,46 @@ from ..core.config import DataConfig
 from ..core.ranges import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
-from ..data.description import PrepareRecord, read_description, read_record
-from ..data.files import in_order
+from ..data.contents import overexposed
 from ..data.found_tools import UNCERTAIN, read_rows
-from ..data.images import read_color
+from ..data.image_folders import needs_depth
 from ..data.pixels import measured_share
 from ..data.scale import Scale
 from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
-from ..footage.components import InOrder
 from ..footage.known_facts import KnownFacts
 from ..footage.masked_tissue import MaskedTissue, find_masked_tissue
-from ..footage.overlays import find_static_overlays, without_strokes
-from ..footage.pose_fit import PoseFit, View, measure_poses
-from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
-from ..footage.units import FAR_MM, Polarity, UnitGuess, guess_unit, mask_polarity
+from ..footage.overlays import without_strokes
+from ..footage.pose_fit import PoseFit
+from ..footage.text_network import TextDetector
+from ..footage.texts import resting_rectangles
+from ..footage.units import FAR_MM, Polarity, UnitGuess
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
 from ..system.parallel import Pool, frame_threads
+from .finding import About
+from .samples import (
+    StereoFacts,
+    about_sequence,
+    are_inverted,
+    as_read,
+    measure_polarity,
+    measure_pose_fit,
+    measure_stereo,
+    measure_unit,
+    sample_frames,
+    true_tissue,
+)
 
 if TYPE_CHECKING:
     from ..initialization.sampling import PointCloud
 
 BYTES_PER_PX = 100  # memory in which a thread measures a frame, bytes for each px
-SAMPLES = 20  # evenly spaced frames for expensive measurements
 MOTION_FRAMES = 300  # largest number of frames for the camera motion
-CERTAIN = 0.5  # least certainty to report masks as inverted
 POINT_FRAMES = 24  # largest number of training frames for the initial points
 LABEL_ON_TISSUE = 0.75  # least share of a text box that the masks mark as tissue
-COMPARED = 3  # stereo pairs to compare, evenly spaced
 USUAL_RATE = 25.0  # frames/s of a sequence that does not say it
 BINS = 80  # of the histogram of depth
 EVERY = 7  # the distribution of depth uses every 7th pixel
@@ -67,7 +75,7 @@ class MaskFacts:
     @property
     def inverted(self) -> bool:
         """Whether tissue and tool are certainly swapped."""
-        return not self.polarity.tool_is_high and self.polarity.certainty >= CERTAIN
+        return are_inverted(self.polarity)
 
     @property
     def uncertain(self) -> tuple[int, ...]:
@@ -77,7 +85,7 @@ class MaskFacts:
     @property
     def reason(self) -> str:
         """The measurements in one line."""
-        return self.polarity.reason.replace("high values cover", "pixels read as tool cover")
+        return as_read(self.polarity)
 
     def tissue(self, frame: Frame) -> Mask:
         """(H, W) True on the tissue of a frame; inverted masks are corrected."""
@@ -114,40 +122,22 @@ class DepthFacts:
     counts: NDArray[np.int64]  # (80,) sampled tissue pixels in each bin
     step: float  # median difference between neighboring values of a frame
     bits: int | None  # per stored value; None if unknown
-    scale: float  # mm per stored unit: the option, else the value in `sequence.json`, else 1
     unit: UnitGuess
     relative: bool  # whether the folder states that its scale is unknown
     known: Scale | None = None  # how relative depth was brought to mm
 
 
 @dataclass(frozen=True)
-class StereoFacts:
-    """Consistency of the left and right images."""
-
-    order: StereoOrder  # share of the image that matches in either order, mean over the compared frames
-    vertical_px: float  # median vertical offset of matching features, px, >= 0; NaN if there are too few matches
-
-    @property
-    def reason(self) -> str:
-        """The measurements in one line."""
-        rows = f"rows {self.vertical_px:.1f} px apart" if np.isfinite(self.vertical_px) else "too few matches"
-        return f"{self.order.as_given:.0%} of the image matches as given, {self.order.exchanged:.0%} swapped; {rows}"
-
-
-@dataclass(frozen=True)
-class Facts:
+class Facts(About):
     """All measurements of a sequence."""
 
-    path: Path
-    frames: int  # T
     train_frames: int
     test_frames: int
     frames_per_second: float | None
     camera: Camera  # of the first frame
-    described: dict[str, Any]  # content of `sequence.json`; empty without one
-    sources: dict[str, str]  # where each part comes from, if the folder states it
     takes_masks: bool  # whether masks that a person paints are read; some layouts have none
     notes: tuple[str, ...]  # of the reader, one line each
+    needs_depth: bool  # whether the folder has images only, and perhaps masks
     camera_path_mm: float  # largest distance of a stored camera from the first one
     camera_turn_deg: float  # largest rotation of a stored camera from the first one
     motion: CameraMotion  # of the image as a whole
@@ -156,13 +146,12 @@ class Facts:
     """First frame, and the frame after the last one, of each window that `train` would cut the sequence into."""
     pose_fit: PoseFit | None  # how well the stored poses explain the images; None for a static camera
     changes: Changes
+    overexposed: NDArray[np.float64]  # (T,) share of the tissue that is; 0 for the usual highlights
     masks: MaskFacts
     border: BorderFacts
     depth: DepthFacts
     stereo: StereoFacts | None  # None without right images
     cloud: PointCloud | None  # initial points from at most 24 training frames; None if there are none
-    data: DataConfig  # options with which the sequence was opened
-    record: PrepareRecord | None  # how `prepare` made the folder, if it did
 
     @property
     def camera_is_fixed(self) -> bool:
@@ -190,9 +179,9 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None, known: Known
 def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool: Pool) -> Facts:
     count = len(sequence)
     frames = sequence.frames("video")
-    samples = [sequence.frame(int(i)) for i in spread(count, SAMPLES)]
+    samples = sample_frames(sequence)
     images = [frame.rgb_u8 for frame in samples]
-    polarity = mask_polarity([~frame.tissue_mask for frame in samples], images)
+    polarity = measure_polarity(samples)
     outline = find_outline(without_strokes(images))
     decoded = pool.map(frames.__getitem__, range(count))  # and kept as memory allows
     masked = masked_border(outline, images, (frame.tissue_mask for frame in decoded))
@@ -206,23 +195,20 @@ def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool:
         pool.map,
     )
     masks = MaskFacts(tool_fraction, polarity, _confidence(sequence), tissue_like)
-    tissue = [masks.tissue(frame) for frame in samples]
+    tissue = true_tissue(samples, polarity)
     step = -(-count // MOTION_FRAMES)
     followed = [sequence.frame(i) for i in range(0, count, step)]
     cameras = [sequence.camera(i) for i in range(count)]
     distance, turn = _camera_path(cameras)
-    described = read_description(sequence.path / "sequence.json")
     return Facts(
-        path=sequence.path,
-        frames=count,
+        **vars(about_sequence(sequence, cfg)),
         train_frames=len(sequence.indices("train")),
         test_frames=len(sequence.indices("test")),
         frames_per_second=sequence.frames_per_second,
         camera=cameras[0],
-        described=described,
-        sources=dict(sequence.sources),
         takes_masks=sequence.takes_masks,
         notes=tuple(sequence.remarks),
+        needs_depth=needs_depth(sequence.path),
         camera_path_mm=distance,
         camera_turn_deg=turn,
         motion=known.camera_motion(
@@ -230,16 +216,20 @@ def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool:
         ),
         motion_step=step,
         windows=tuple(plan_windows(cameras, look_through(sequence), preset("default").windows.longest)),
-        pose_fit=_pose_fit(sequence, pool.map),
+        pose_fit=measure_pose_fit(sequence, pool.map),
         changes=known.find_changes(lambda: (frame.rgb_u8 for frame in frames), pool.map),
+        overexposed=np.array([_overexposed_share(frame) for frame in frames]),
         masks=masks,
         border=_border(outline, images, tissue, masked),
-        depth=_depth(sequence, samples, tissue, described, cfg),
-        stereo=_stereo(sequence),
+        depth=_depth(sequence, samples, tissue),
+        stereo=measure_stereo(sequence),
         cloud=_first_points(sequence),
-        data=cfg,
-        record=read_record(sequence.path),
     )
+
+
+def _overexposed_share(frame: Frame) -> float:
+    saturated = overexposed(frame)
+    return 0.0 if saturated is None else float(saturated.sum() / frame.tissue_mask.sum())
 
 
 def _confidence(sequence: FrameSequence) -> NDArray[np.float64]:
@@ -290,7 +280,7 @@ def _border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: lis
         outline.outside,
         _mean(tissue[outline.outside]),
         outline.other.sharpness,
-        tuple(filter(is_label, find_static_overlays(images))),
+        tuple(filter(is_label, resting_rectangles(images[::2], TextDetector().find))),
         masked,
     )
 
@@ -299,9 +289,7 @@ def _mean(values: NDArray) -> float:
     return float(values.mean()) if values.size else 0.0
 
 
-def _depth(
-    sequence: FrameSequence, samples: list[Frame], tissue: list[Mask], described: dict[str, Any], cfg: DataConfig
-) -> DepthFacts:
+def _depth(sequence: FrameSequence, samples: list[Frame], tissue: list[Mask]) -> DepthFacts:
     """Coverage and median of every frame, and the distribution over the samples, of which this is the tissue."""
     coverage, median, far = [], [], []
     for frame in sequence.frames("video"):
@@ -331,38 +319,7 @@ def _depth(
         counts,
         step=float(np.median(usual)) if usual else 0.0,
         bits=header[24] if len(header) == 26 else None,
-        scale=float(cfg.depth_unit_mm or described.get("depth_scale") or 1.0),
-        unit=guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in pairs),
+        unit=measure_unit(samples, tissue),
         relative=sequence.depth_is_relative,
         known=sequence.scale,
     )
-
-
-def _pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
-    """Reproject depth between frames with the stored poses; None for a static camera or without enough corners."""
-    first = sequence.camera(0)
-
-    def view(index: int) -> View:
-        frame = sequence.frame(index)
-        return frame.rgb_u8, frame.tissue_mask, np.where(frame.depth_valid, frame.depth, np.float32(0))
-
-    matrix = np.array([[first.fx, 0, first.cx - 0.5], [0, first.fy, first.cy - 0.5], [0, 0, 1]])
-    stored = np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))])
-    poses = np.linalg.inv(stored).astype(np.float64)
-    return measure_poses(view, matrix, poses, relative=sequence.depth_is_guessed, each=each)
-
-
-def _stereo(sequence: FrameSequence) -> StereoFacts | None:
-    """Compare both cameras in a few frames; None unless the folder has a right PNG of that size for each frame."""
-    files = in_order((sequence.path / "right").glob("*.png"))
-    camera, count = sequence.camera(0), len(sequence)
-    if len(files) != count or read_color(files[0]).shape[:2] != (camera.height, camera.width):
-        return None  # shrunk, or only a part of the folder: the matching of images to frames is unknown
-    pairs = [
-        (sequence.frame(int(i)).rgb_u8, read_color(files[int(i)], (camera.width, camera.height)))
-        for i in np.linspace(0, count - 1, COMPARED).round()
-    ]
-    orders = [stereo_order(*pair) for pair in pairs]
-    mean = StereoOrder(*(float(np.mean([getattr(o, name) for o in orders])) for name in ("as_given", "exchanged")))
-    known = [offset for offset in (vertical_offset_px(*pair) for pair in pairs) if np.isfinite(offset)]
-    return StereoFacts(mean, float(np.median(known)) if known else float("nan"))

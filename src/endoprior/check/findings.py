@@ -6,28 +6,25 @@ The codes are stable; docs/check.md explains each.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Literal
 
 import numpy as np
 
-from ..core.checks import number_ranges, quotation, read_ranges
+from ..core.checks import quotation
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
 from ..core.shell import command
 from ..data.description import MOTION, SIZE_NOT_STATED
+from ..data.image_folders import ways_to_prepare
 from ..footage.camera_motion import MOVING_FRACTION
 from ..footage.units import FAR_MM
 from ..model.presets import preset
+from .errors import scene_cuts, swapped_eyes, swapped_masks, wrong_poses, wrong_unit
 from .facts import Facts
-
-Severity = Literal["error", "warning", "note"]
+from .finding import Finding, frame_list, longest_part, set_values, skip
 
 TOOL_MOST = 0.6  # With a larger share of tool pixels there is too little tissue for training
 COVERED = 0.5  # Depth on a smaller share of the tissue is sparse
-FEW_FRAMES, FEWEST_FRAMES = 10, 2
-"""Fewer than the first contain little motion and leave one test frame; training needs the second."""
+FEW_FRAMES = 10  # Fewer contain little motion and leave one test frame
 SEEN_AS_TISSUE = 0.5  # A border is reported if the masks mark a larger share of it as tissue
 VERTICAL_PX = 1.5  # Largest vertical offset of rectified cameras, px
 ODD_VIEW_DEG = (20.0, 120.0)  # Range of the horizontal field of view of endoscopes
@@ -38,30 +35,16 @@ ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
 """Seconds of a training iteration with `default` on two cores, start included, at this size of the image, and the share
 that does not depend on it (docs/results.md)."""
 DARK = 0.05  # Images with a smaller mean, of 1, are nearly black
+EXPORT = "export them again, with all values from 0 to 255 in use"
+WHITE = 0.99  # A larger share of the tissue that is overexposed leaves nothing to train on
 FAR_SHARE = 1e-3
 """A larger share of the tissue beyond the reach of an endoscope is a filling of holes, or a wrong depth."""
 DEPTH_JUMP = 0.2  # Change of the log median depth between two frames that is too large for tissue motion
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One problem of a sequence."""
-
-    code: str  # Stable name
-    severity: Severity
-    """`error`: training would fail or learn something wrong; `warning`: it costs quality; `note`: good to know."""
-    what: str  # The problem, on one line
-    fix: str
-    """What to do: an edit, or a command or options of one in backticks. Numbers of frames are those of this check."""
-    frames: tuple[int, ...] = ()  # Affected frames; empty for all
-
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.code}: {self.what}. Fix: {self.fix}"
-
-
 def find(facts: Facts) -> list[Finding]:
     """All findings, errors first."""
-    checks = (_masks, _depth, _unit, _border, _stereo, _motion, _poses, _windows, _changes, _video, _intrinsics, _rest)
+    checks = (_masks, _depth, _border, _stereo, _motion, _poses, _windows, _changes, _video, _intrinsics, _rest)
     order = ("error", "warning", "note")
     return sorted((found for check in checks for found in check(facts)), key=lambda found: order.index(found.severity))
 
@@ -91,7 +74,7 @@ def _intrinsics(facts: Facts) -> Iterator[Finding]:
         return
     width, height = camera.width * facts.data.shrink, camera.height * facts.data.shrink
     usual = {"fx": USUAL_FOCAL * width, "fy": USUAL_FOCAL * width, "cx": width / 2, "cy": height / 2}
-    fix = _set_values(facts, **{name: f"{value:g}" for name, value in usual.items()})
+    fix = set_values(facts, **{name: f"{value:g}" for name, value in usual.items()})
     fix += f", which is usual for endoscopes, or what the calibration says for {width}x{height} px"
     if facts.sources.get("depth", "").startswith("stereo"):
         fix += ", and measure depth again: it comes from the same numbers"
@@ -100,11 +83,14 @@ def _intrinsics(facts: Facts) -> Iterator[Finding]:
 
 def _masks(facts: Facts) -> Iterator[Finding]:
     masks, mean = facts.masks, float(facts.masks.tool_fraction.mean())
+    if unsure := masks.uncertain:
+        what = f"the program that found the tools is unsure in {frame_list(unsure)}"
+        fix = f"look at them and correct them: `{command('view', facts.path)}`"
+        yield Finding("uncertain-masks", "warning", what, fix, unsure)
+    yield from swapped_masks(facts, masks.polarity)
     if masks.inverted:
-        what = f"tissue and tool are swapped in the masks ({masks.reason})"
-        value = 0 if facts.described.get("mask_tool_value", 255) == 255 else 255
-        yield Finding("mask-polarity", "error", what, _set_values(facts, mask_tool_value=value))
-    elif mean > TOOL_MOST:
+        return
+    if mean > TOOL_MOST:
         what = f"{mean:.0%} of the pixels inside the border are tool"
         again = "" if "tools found" in facts.sources.get("masks", "") else ", or find tools by `endoprior masks`"
         yield Finding("tool-fraction", "warning", what, f"correct the masks, 5 % to 40 % are usual{again}")
@@ -112,11 +98,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         only = ": the masks cover only the border" if facts.border.masked.any() else ""
         what = f"no tools were found{only}; if tools are in view, they become tissue"
         yield Finding("tool-fraction", "warning", what, f"nothing if no tool is in view; else {_add_tools(facts)}")
-    if unsure := facts.masks.uncertain:
-        what = f"the program that found the tools is unsure in {_frames(unsure)}"
-        fix = f"look at them and correct them: `{command('view', facts.path)}`"
-        yield Finding("uncertain-masks", "warning", what, fix, unsure)
-    if (like := facts.masks.tissue_like) and not masks.inverted:
+    if like := masks.tissue_like:
         what = f"what is masked at x {like.x}, y {like.y} of frame {like.frame} moves with the tissue in every frame"
         free = command("masks", facts.path, "--tissue", f"{like.frame},{like.x},{like.y}")
         fix = f"nothing if it is a tool; else `{free}`"
@@ -130,11 +112,12 @@ def _depth(facts: Facts) -> Iterator[Finding]:
     # With inverted masks, depth on tissue cannot be checked.
     empty = tuple(int(i) for i in np.flatnonzero(depth.coverage == 0))
     if len(empty) == facts.frames and unit.unit == "none":
-        yield Finding("no-depth-frames", "error", "no frame has depth", again or f"add {path}/depth in mm")
+        fix = ways_to_prepare(path) if facts.needs_depth else again or f"add {path}/depth in mm"
+        yield Finding("no-depth-frames", "error", "no frame has depth", fix)
         return
     if empty and not facts.masks.inverted:
-        what = f"no depth on tissue in {_frames(empty)}"
-        fix = again if again and len(empty) > facts.frames / 2 else _skip(facts, empty)
+        what = f"no depth on tissue in {frame_list(empty)}"
+        fix = again if again and len(empty) > facts.frames / 2 else skip(facts, empty)
         yield Finding("no-depth-frames", "warning", what, fix, empty)
     covered = float(np.median(depth.coverage))
     if 0 < covered < COVERED and not facts.masks.inverted:
@@ -151,35 +134,17 @@ def _depth(facts: Facts) -> Iterator[Finding]:
     beyond = tuple(int(i) for i in np.flatnonzero(depth.far > FAR_SHARE))
     if beyond and unit.unit == "mm" and not depth.relative:
         share = float(depth.far[list(beyond)].mean())
-        what = f"depth beyond {FAR_MM:g} mm on {share:.1%} of the tissue with depth in {_frames(beyond)}"
+        what = f"depth beyond {FAR_MM:g} mm on {share:.1%} of the tissue with depth in {frame_list(beyond)}"
         fix = f"store 0 where depth is missing, in {path}/depth{or_again}"
         yield Finding("depth-far", "warning", what, fix, beyond)
     steps = np.abs(np.diff(np.log(np.where(depth.median > 0, depth.median, np.nan))))
     usual = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     jumps = tuple(int(i) + 1 for i in np.flatnonzero(steps > max(DEPTH_JUMP, 6 * usual)))
     if jumps:
-        what = f"the median depth jumps at {_frames(jumps)}"
+        what = f"the median depth jumps at {frame_list(jumps)}"
         fix = f"bring the depth of all frames to one scale{or_again}"
         yield Finding("depth-jumps", "warning", what, fix, jumps)
-
-
-def _unit(facts: Facts) -> Iterator[Finding]:
-    unit = facts.depth.unit
-    if unit.unit == "disparity":
-        fix = "store depth in mm: focal length (px) x baseline (mm) / disparity (px)"
-        fix += ", or run `prepare` with `--depth-relative disparity` for relative depth"
-        yield Finding("depth-disparity", "error", unit.reason, fix)
-    elif facts.depth.relative or facts.depth.known or unit.unit in ("mm", "none"):
-        return
-    elif unit.mm_per_unit is None:
-        fix = f"{_set_values(facts, depth_scale='MM_PER_UNIT')}, so that the tissue is some 20 to 250 mm away"
-        yield Finding("depth-unit", "error", unit.reason, fix)
-    else:
-        code = {"m": "depth-metres", "cm": "depth-centimetres"}.get(unit.unit, "depth-unit")
-        what = f"depth looks like {unit.unit}, not mm ({unit.reason})"
-        scale = f"{facts.depth.scale * unit.mm_per_unit:.6g}"
-        fix = f"{_set_values(facts, depth_scale=scale)}, or train with `--data.depth-unit-mm {scale}`"
-        yield Finding(code, "error", what, fix)
+    yield from wrong_unit(facts, unit, is_guess=depth.relative or depth.known is not None)
 
 
 def _border(facts: Facts) -> Iterator[Finding]:
@@ -223,10 +188,8 @@ def _poses(facts: Facts) -> Iterator[Finding]:
     fit = facts.pose_fit
     if fit is None:
         return
-    if fit.another_fits:
-        what = f"the camera poses explain the images better in another convention: depth reprojects to {fit.reason}"
-        yield Finding("poses-convention", "error", what, _convert_poses(facts, fit.best, fit.unit))
-    elif fit.none_fits:
+    yield from wrong_poses(facts, fit)
+    if fit.none_fits:
         what = f"the camera poses do not explain the images in any convention: depth reprojects to {fit.reason}"
         fix = f"match each pose to its frame, or `{command('poses', facts.path, '--poses', 'estimate')}`"
         yield Finding("poses-convention", "warning", what, fix)
@@ -252,55 +215,56 @@ def _windows(facts: Facts) -> Iterator[Finding]:
 def _changes(facts: Facts) -> Iterator[Finding]:
     changes = facts.changes
     if copies := changes.duplicates:
-        what = f"{len(copies)} of {facts.frames} frames repeat the one before: {_frames(copies)}"
+        what = f"{len(copies)} of {facts.frames} frames repeat the one before: {frame_list(copies)}"
         originals = sorted(set(range(facts.frames)) - set(copies))
         stride = originals[1] if len(originals) > 1 else 0
         regular = stride > 1 and originals == list(range(0, facts.frames, stride))
         regular = regular and facts.data in (DataConfig(), DataConfig(shrink=facts.data.shrink))
-        fix = f"train with `--data.stride {stride}`" if regular else _skip(facts, copies)
+        fix = f"train with `--data.stride {stride}`" if regular else skip(facts, copies)
         yield Finding("duplicate-frames", "warning", what, fix, copies)
-    jumps: tuple[tuple[str, Severity, tuple[int, ...], str], ...] = (
-        ("exposure-jump", "warning", changes.exposure_jumps, "the brightness of the whole image jumps at"),
-        ("scene-cut", "error", changes.cuts, "the view changes abruptly at"),
-    )
-    for code, severity, frames, what in jumps:
-        if frames:
-            yield Finding(code, severity, f"{what} {_frames(frames)}", _longest_part(facts, frames), frames)
+    if jumps := changes.exposure_jumps:
+        what = f"the brightness of the whole image jumps at {frame_list(jumps)}"
+        yield Finding("exposure-jump", "warning", what, longest_part(facts, jumps), jumps)
+    yield from scene_cuts(facts, changes.cuts)
     # Frames that `prepare` marked count from the first one of the folder.
     whole = facts.data == DataConfig(shrink=facts.data.shrink)
     marked = facts.described.get("unexplained_frames", []) if whole else []
     odd = tuple(sorted({*changes.blurred, *changes.off_color, *marked}))
     if odd:
         reasons = "blurred, covered or outside the body" + (", damaged, or without a camera pose" if marked else "")
-        what = f"{reasons}: {_frames(odd)}"
-        fix = _skip(facts, odd)
+        what = f"{reasons}: {frame_list(odd)}"
+        fix = skip(facts, odd)
         if len(marked) == facts.frames:
             what += "; these are all, so that training uses them as if each had a pose"
             fix = "use another part of the video, or more frames per second"
         elif marked and facts.data.reliability == "used":
-            what += f"; neither trained on nor scored are {_frames(tuple(marked))}"
+            what += f"; neither trained on nor scored are {frame_list(tuple(marked))}"
         yield Finding("unexplained-frames", "warning", what, fix, odd)
 
 
 def _video(facts: Facts) -> Iterator[Finding]:
-    """What `prepare` found particular about the video, and images that are nearly black."""
+    """What `prepare` found particular about the video, and images that are nearly black, or white in part."""
     brightness = float(np.median(facts.changes.brightness))
     if brightness < DARK:
         what = f"the images are nearly black: their mean is {255 * brightness:.0f} of 255"
-        yield Finding("dark-images", "warning", what, "export them again, with all values from 0 to 255 in use")
+        yield Finding("dark-images", "warning", what, EXPORT)
+    if facts.overexposed.mean() > WHITE:
+        what = "all tissue is overexposed: white, and without any detail"
+        yield Finding("overexposed", "error", what, f"{EXPORT}; if the video is so, choose another part of it")
+    elif len(white := np.flatnonzero(facts.overexposed)):
+        share, frames = facts.overexposed[white].mean(), tuple(white.tolist())
+        what = f"{share:.0%} of the tissue is overexposed, in {frame_list(frames)}: its color is a guess"
+        fix = "nothing for this video: the color is lost; record with less light or exposure"
+        yield Finding("overexposed", "warning", what, fix, frames)
     fix = "nothing if you expect this; else copy or export the video again"
     yield from (Finding("video", "note", quotation(n), fix) for n in (facts.record.video_notes if facts.record else ()))
 
 
 def _stereo(facts: Facts) -> Iterator[Finding]:
-    stereo, path = facts.stereo, facts.path
+    stereo = facts.stereo
     if stereo is None:
         return
-    if stereo.order.swapped:
-        fix = "run `prepare` with `--swap-eyes`, or without it where it was given; "
-        fix += f"by hand: swap the folders {path}/images and {path}/right, and measure depth again"
-        what = f"left and right images are swapped ({stereo.reason})"
-        yield Finding("swapped-eyes", "error", what, fix)
+    yield from swapped_eyes(facts, stereo.order)
     if stereo.vertical_px > VERTICAL_PX:
         what = f"the rows of left and right images are {stereo.vertical_px:.1f} px apart"
         moved = facts.record and "--row-offset" in facts.record.options
@@ -316,39 +280,10 @@ def _rest(facts: Facts) -> Iterator[Finding]:
     if facts.cloud is None and not explained:
         what = "no pixel is tissue and has depth, so training has no initial points"
         yield Finding("no-points", "error", what, "check masks and depth in the figure")
+    wrong = "`prepare` makes what is missing" if facts.needs_depth else "correct the file that is named"
     for note in facts.notes:
-        yield Finding("reader", "note", note, "check the files")
-
-
-def _frames(frames: tuple[int, ...]) -> str:
-    """Frame numbers as text, at most six ranges: `frames 3-7, 9`."""
-    return f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames, 6)}"
-
-
-def _set_values(facts: Facts, **values: Any) -> str:
-    """The edit that sets entries of `sequence.json`; it may not exist yet."""
-    entries = ", ".join(f'"{name}": {value}' for name, value in values.items())
-    file = facts.path / "sequence.json"
-    return f"set {entries} in {file}" if facts.described else f"write {{{entries}}} to {file}"
-
-
-def _skip(facts: Facts, frames: tuple[int, ...]) -> str:
-    """Train without some frames; a look at the files if too few are left."""
-    if facts.frames - len(set(frames)) < FEWEST_FRAMES:
-        return f"look at the images in {facts.path}: they may not be one video of one scene"
-    before = read_ranges("skip_frames", facts.data.skip_frames)
-    # Positions of the frames of this check among those that it would have without `skip_frames`.
-    places = [place for place in range(facts.frames + len(before)) if place not in before]
-    left_out = sorted({*before, *(places[frame] for frame in frames)})
-    return f"train with `--data.skip-frames {number_ranges(left_out, len(left_out)).replace(' ', '')}`"
-
-
-def _longest_part(facts: Facts, jumps: tuple[int, ...]) -> str:
-    """Train on the longest part between jumps, each the first frame of a part."""
-    first, end = max(pairwise([0, *jumps, facts.frames]), key=lambda part: part[1] - part[0])
-    if first == 0 and not facts.data.skip_frames:
-        return f"train with `--data.first-frames {end}`"
-    return _skip(facts, (*range(first), *range(end, facts.frames)))
+        fix = "run that command" if "`endoprior " in note else f"nothing if that is so; else {wrong}"
+        yield Finding("reader", "note", note, fix)
 
 
 def _measure_again(facts: Facts) -> str:
@@ -375,20 +310,9 @@ def _rescale_camera(facts: Facts, factor: float) -> str:
     numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     values = {name: f"{value * facts.data.shrink / factor:g}" for name, value in numbers.items()}
     if facts.sources.get("depth", "").startswith("stereo"):
-        values["depth_scale"] = f"{facts.depth.scale / factor:.6g}"
-    fix = f"{_set_values(facts, **values)}, or what the calibration says for these images"
+        values["depth_scale"] = f"{facts.depth_scale / factor:.6g}"
+    fix = f"{set_values(facts, **values)}, or what the calibration says for these images"
     if record and "--calibration" in record.options:
         size = "x".join(str(round(side * factor)) for side in record.source_size)
         fix += f"; or run `prepare` with `--calibration-size {size}`, if the calibration was made at this size"
     return fix
-
-
-def _convert_poses(facts: Facts, convention: str, unit: float) -> str:
-    """The command that reads the stored poses in another convention, in the folder itself where that is possible."""
-    file = facts.path / "poses_bounds.npy"
-    if not file.is_file():
-        return "store camera-to-world matrices in mm with OpenCV axes (x right, y down, z forward)"
-    options = ["--poses-convention", convention] if convention != "opencv" else []
-    options += ["--poses-unit-mm", f"{unit:.4g}"] if unit != 1 else []
-    in_place = command("poses", facts.path, "--poses", file, *options)
-    return f"`{in_place}`, which keeps the old ones in poses_bounds_before.npy"

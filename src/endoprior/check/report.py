@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.checks import quotation
 from ..core.geometry import length_unit
+from ..data.files import read_parts
 from ..footage.border import CERTAIN
 from .facts import Facts
 from .findings import Finding
@@ -99,6 +100,11 @@ def _border_words(facts: Facts) -> str:
     masked = float(facts.border.masked.mean())
     words += [f"{masked:.1%} of pixels masked"] if masked else []
     return ", ".join(words) or "none"
+
+
+def read_findings(path: Path, fix: str) -> tuple[Finding, ...]:
+    """The findings in a JSON file that holds what `as_json` gave; they may come from somebody else."""
+    return read_parts(path, {"findings": tuple[Finding, ...]}, fix)["findings"]
 
 
 def _plain(value: Any) -> Any:

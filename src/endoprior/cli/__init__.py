@@ -12,14 +12,15 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from ..core.checks import InputError, input_error
+from ..core.checks import InputError, input_error, or_did_you_mean
+from ..core.kernel_folder import without_kernel_cache
 from ..system.atomic import DISK_ERRORS
 from ..system.console import complain, complete_streams, say
 from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 from ..system.plugins import Registry
 from ..system.signals import all_interrupt
-from ..system.surroundings import reject_surroundings, set_library_variables
+from ..system.surroundings import reject_surroundings, set_up_process
 
 COMMANDS = {
     "run": ("run", "from a video to a model to look at: prepare, check, train, score, video, player"),
@@ -40,6 +41,7 @@ COMMANDS = {
     "view": ("view", "show a trained scene, or a sequence before training, in a web browser"),
     "doctor": ("doctor", "report versions, and try the backends that could render on this computer"),
     "batch": ("batch", "do `run` for many videos and sequence folders, here or on a Ray cluster"),
+    "completion": ("completion", "print a script that lets the Tab key complete commands and options"),
     "plugins": ("doctor", "list what other packages add, and what is built in: datasets, methods, scores, ..."),
 }
 """Name -> module of this package with the class of that name (`eval`: `Eval`), and one-line description."""
@@ -62,7 +64,7 @@ def main(argv: list[str] | None = None) -> int:
     Args:
         argv: arguments without the program's name; None takes them from the process.
     """
-    set_library_variables()
+    set_up_process()
     complete_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # write characters that its encoding lacks as \xNN
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -92,7 +94,8 @@ def _run(name: str, rest: list[str]) -> int:
         say(version("endoprior"))
         return 0
     if name not in (names := REGISTRY.names()):
-        raise input_error(name, f"one of {', '.join(names)}", "no such command", "`endoprior --help` explains each.")
+        fix = or_did_you_mean("`endoprior --help` explains each.", name, names, "endoprior ")
+        raise input_error(name, f"one of {', '.join(names)}", "no such command", fix)
     reject_small_limits()
     reject_surroundings()
     with all_interrupt():
@@ -101,7 +104,9 @@ def _run(name: str, rest: list[str]) -> int:
 
 
 def system_failure(error: Exception) -> str | None:
-    """The error message for failures of memory and the file system; None for a bug."""
+    """The error message for failures of memory, the file system and what surrounds us; None for a bug."""
+    if no_cache := without_kernel_cache(error):
+        return str(no_cache)
     whole = " ".join(str(error).split())
     if type(error).__name__ == "OutOfMemoryError":  # raised by torch for a GPU; its message starts with the numbers
         fix = "Use smaller frames, fewer --gaussians or --device cpu"
@@ -125,7 +130,7 @@ def descriptions() -> dict[str, str]:
 
 def overview() -> str:
     """The text of `endoprior --help`."""
-    lines = "\n".join(f"  {name:<9}{about}" for name, about in descriptions().items())
+    lines = "\n".join(f"  {name:<12}{about}" for name, about in descriptions().items())
     return (
         "usage: endoprior COMMAND ...\n\n"
         "From an endoscope video to a moving 3D model of the tissue, on any CPU. Research use only.\n\n"

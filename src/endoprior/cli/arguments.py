@@ -15,16 +15,19 @@ from argparse import SUPPRESS, ArgumentParser, HelpFormatter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from functools import cache, partial
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from types import NoneType
 from typing import Any, ClassVar, Literal, NoReturn, Self, TypeVar, get_args, get_origin, get_type_hints
 
-from ..core.checks import InputError, input_error, quotation, similar_name
+from ..core.checks import InputError, input_error, or_did_you_mean, quotation, similar_name
+from ..core.shell import quoted
 from ..system.console import say
 
 A = TypeVar("A")
 C = TypeVar("C", bound="Command")
-WRONG_CHOICE = re.compile(r"argument (--[^\s/]+): invalid choice: '(.*)' \(choose from (.*)\)")
+UNKNOWN, REQUIRED = "unrecognized arguments: ", "the following arguments are required: "
+"""Messages of argparse, before what they name."""
+WRONG_CHOICE = re.compile(r"argument ([^\s/]+): invalid choice: '(.*)' \(choose from (.*)\)")
 """A message of argparse: option, what was typed, and the choices."""
 
 
@@ -114,7 +117,7 @@ def option_name(word: str) -> str:
 def parse(cls: type[C], argv: Sequence[str], command: str, **defaults: Any) -> C:
     """Fill `cls` from `argv`, with `defaults`; `--help` and `--help-all` print a page and exit with status 0."""
     arguments, everything = list(options(cls, defaults)), "--help-all" in argv or not cls.basics
-    parser = _parser(cls, command, arguments, everything)
+    parser = parser_of(cls, command, arguments, everything)
     if {"-h", "--help", "--help-all"} & set(argv):
         examples = "".join(f"\n  endoprior {command} {words}".rstrip() for words in cls.examples)
         count = sum(not each.is_positional for each in arguments)
@@ -126,6 +129,7 @@ def parse(cls: type[C], argv: Sequence[str], command: str, **defaults: Any) -> C
         fix = "Set the shell variable, or remove the empty argument."
         raise input_error(f"endoprior {command}", "no empty argument", "one", fix)
     words = [option_name(word) + word[len(option_name(word)) :] if word.startswith("--") else word for word in argv]
+    parser.typed = words
     given = vars(parser.parse_intermixed_args(words))
     try:
         return _filled(cls, defaults, {path: value for path, value in given.items() if value is not None})
@@ -157,16 +161,38 @@ def options(cls: type, defaults: Mapping[str, Any], path: str = "", section: str
 class Parser(ArgumentParser):
     """A parser whose errors are those of this program."""
 
+    typed: Sequence[str] = ()
+    """What it is to parse."""
+
     def error(self, message: str) -> NoReturn:
+        known, unknown = list(self._option_string_actions), message.removeprefix(UNKNOWN).split()
+        if message.startswith(REQUIRED):  # an option with another name may be why something is missing
+            unknown = [word for word in self.typed if word.startswith("--") and option_name(word) not in known]
+            message = UNKNOWN + " ".join(unknown) if unknown else message
         fix = f"`{self.prog} --help-all` lists all options"
+        if message.startswith(REQUIRED):
+            fix = f"`{self.with_missing(message.removeprefix(REQUIRED).split(', '))}`; {fix}"
+        if message.startswith(UNKNOWN):
+            mistyped = next((option_name(word) for word in unknown if word.startswith("-")), "")
+            fix = or_did_you_mean(f"{fix}.", mistyped, known)
+            raise InputError(f"{self.prog}: {quotation(message)}. Fix: {fix}")
         if choice := WRONG_CHOICE.match(message):
             name, typed, known = choice.groups()
             nearest = similar_name(typed, known.replace("'", "").split(", "))
-            fix = f"`{name} {nearest}`" if nearest else fix
+            shown = f"{name} {nearest}" if name.startswith("-") else f"{self.prog} {nearest}"
+            others = f"{fix}; `endoprior plugins` lists the presets of other packages"
+            fix = f"`{shown}`" if nearest else others if name == "--preset" else fix
         raise InputError(f"{self.prog}: {quotation(message.removeprefix('argument '))}. Fix: {fix}.")
 
+    def with_missing(self, missing: Sequence[str]) -> str:
+        """The command with the places that were not given, behind those that were if these stand first."""
+        places = [str(action.metavar) for action in self._get_positional_actions()]
+        given = [*takewhile(lambda word: not word.startswith("-"), self.typed)]
+        known = places.index(missing[0])
+        return " ".join([self.prog, *(map(quoted, given) if len(given) == known else places[:known]), *missing])
 
-def _parser(cls: type[Command], command: str, arguments: Sequence[Option], everything: bool) -> ArgumentParser:
+
+def parser_of(cls: type[Command], command: str, arguments: Sequence[Option], everything: bool) -> Parser:
     """A parser that takes all arguments, and whose help shows all or the basic ones."""
     places = [each.name if each.default is MISSING else f"[{each.name}]" for each in arguments if each.is_positional]
     rest = ["[options]"] if len(arguments) > len(places) else []
@@ -184,7 +210,9 @@ def _parser(cls: type[Command], command: str, arguments: Sequence[Option], every
         text = each.help(brief=not (everything or each.is_positional))
         if each.is_positional:
             count = None if each.default is MISSING else "?"
-            parser.add_argument(each.path, metavar=each.name, help=text, nargs=count, type=each.kind, default=None)
+            choices = get_args(each.kind) if get_origin(each.kind) is Literal else None
+            about = {"metavar": each.name, "help": text, "nargs": count, "default": None}
+            parser.add_argument(each.path, choices=choices, type=str if choices else each.kind, **about)
             continue
         if everything and each.section not in groups:
             groups[each.section] = parser.add_argument_group(f"{each.section} options".strip(), each.about)

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import InputError, input_error
-from ..data.load import is_sequence
+from ..data.files import or_neighbor
+from ..data.load import is_prepared
 from ..data.reading import kind_of, read_text
 from ..system.console import say
 from .arguments import Command, option_name
@@ -105,11 +106,11 @@ def _parts(words: list[str]) -> tuple[str, Path, list[str]]:
 
 def _job(path: Path, out: Path, options: list[str], tell: Callable[[str], None]) -> SequenceJob:
     if kind_of(path) == "nothing":
-        raise input_error(path, "a video or a sequence folder", "nothing", "correct the path.")
+        raise input_error(path, "a video or a sequence folder", "nothing", or_neighbor("correct the path.", path))
     if single := [word for word in options if option_name(word) in NOT_IN_A_LIST]:
         raise input_error(single[0], "options of what to train", "one of a single training", "remove it.")
     argv = [str(path), str(out), *options]
-    if not is_sequence(path):
+    if not is_prepared(path):
         return Run.from_words(argv).job(tell)
     from ..pipeline import SequenceJob
 

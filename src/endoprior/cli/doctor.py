@@ -26,6 +26,7 @@ OPTIONAL = {
     "ray": "trainings on a cluster",
     "tensorboard": "curves of a training in TensorBoard",
     "tools": "tool masks by SAM 2",
+    "usd": "OpenUSD files",
 }
 """Optional part of the installation -> what it is for."""
 

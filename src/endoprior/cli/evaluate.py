@@ -156,7 +156,7 @@ class Eval(Command):
     def _how(self) -> dict[str, Any]:
         """Options of `scoring.evaluate`."""
         protocols = chosen_protocols(self.protocol) if self.protocol else ()
-        return {"networks": self.networks, "weights_dir": self.weights_dir, "protocols": protocols}
+        return {"networks": self.networks, "download": True, "weights_dir": self.weights_dir, "protocols": protocols}
 
     def _reject(self, names: Sequence[str], expected: str, got: str) -> None:
         """Reject options that would have no effect."""

@@ -45,6 +45,7 @@ class Export(ExportOptions, Command):
         from ..export import export
         from ..export.exporting import format_name
         from ..export.formats import load_format
+        from ..export.loss import loss_note
 
         given = {each.name: getattr(self, each.name) for each in fields(ExportOptions)}
         scene = open_gaussians(self.run)
@@ -61,8 +62,8 @@ class Export(ExportOptions, Command):
             written = export(scene, self.out, options, partial(progress, "exporting"))
         for path in written:
             say(f"{path}: {self._words(scene, name, chosen)}")
-        if scene.config.render.color_slopes and chosen.holds == "Gaussians":
-            say("note: this format knows one color for each Gaussian, so its pictures are less sharp (docs/export.md).")
+        if lost := loss_note(scene, self.out, options, chosen):
+            say(f"note: {lost}")
         if chosen.note:
             say(f"note: {chosen.note(scene, self.out, options)}")
         if scene.lengths_are_relative:

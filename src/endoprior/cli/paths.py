@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import InputError, input_error
+from ..core.shell import command
 from ..data import FrameSequence, load_sequence
-from ..data.load import not_a_run
+from ..data.image_folders import beside
+from ..data.load import is_input, not_a_run
 from ..data.reading import Kind, kind_of
 from ..system.atomic import lies_in, temporary_sibling
 from ..system.console import say
@@ -37,17 +39,9 @@ def open_scene(run: Path) -> RenderedScene:
 
 def open_gaussians(run: Path) -> Scene:
     """`open_scene` for what needs Gaussians; InputError for a scene without."""
+    from ..model.scene import with_gaussians
+
     return with_gaussians(open_scene(run), run)
-
-
-def with_gaussians(scene: RenderedScene, run: Path) -> Scene:
-    """The scene of a run; InputError if it is a radiance field."""
-    from ..model.scene import Scene
-
-    if not isinstance(scene, Scene):
-        fix = "`endoprior render RUN` makes images and a video of it."
-        raise input_error(run, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)
-    return scene
 
 
 def sequence_of(scene: RenderedScene, run: Path, data: Path | None) -> FrameSequence:
@@ -71,6 +65,17 @@ def sequence_if_there(scene: RenderedScene, run: Path, data: Path | None, withou
             raise
         say(f"note: without input frames {without}. {error}")
         return None
+
+
+def require_input_first(name: str, data: Path, out: Path) -> None:
+    """Reject DATA and OUT in the wrong order, and the same path for both, where what was meant is plain."""
+    if (kind := kind_of(data)) == "nothing" and is_input(out):
+        fix = f"the input comes first: `{command(name, out, data)}`."
+        raise input_error(data, "a video or a folder", "no such file or folder", fix)
+    if kind != "nothing" and os.path.abspath(data) == os.path.abspath(out):
+        ending = "run" if name == "train" else "data" if name == "prepare" else "out"
+        fix = f"`{command(name, data, beside(data, ending))}`."
+        raise input_error(out, "a new folder for the results", "the input", fix)
 
 
 def require_writable_file(option: str, path: Path, keep: Path) -> None:

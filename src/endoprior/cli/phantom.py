@@ -24,8 +24,7 @@ class Phantom(Command):
 
     examples = ("DATA", "DATA --frames 16 --width 320 --height 256 --stereo")
     basics = (
-        "--scene --frames --width --height --stereo --seed --instruments --tissue --smoke --gain --camera --noise"
-        " --events"
+        "--scene --frames --width --height --stereo --seed --instruments --tissue --smoke --camera --mechanics --events"
     )
 
     def execute(self) -> None:

@@ -12,8 +12,10 @@ from ..core.checks import check_range, number_ranges
 from ..core.geometry import Convention
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
+from ..prepare.notes import note_line
 from ..system.console import say
 from .arguments import Command
+from .paths import require_input_first
 from .progress import Counting
 
 if TYPE_CHECKING:
@@ -32,7 +34,7 @@ class Prepare(Command):
     """
 
     video: Path = field(metadata={"place": "VIDEO"})
-    """Video file, or folder of images."""
+    """Video file, or folder of images and, if there are any, masks."""
     out: Path = field(metadata={"place": "OUT"})
     """Sequence folder to write; must be new or empty."""
     config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
@@ -49,10 +51,11 @@ class Prepare(Command):
         from ..data.description import RECORD, TOOLS_FOUND, read_description
         from ..prepare import prepare
 
+        require_input_first("prepare", self.video, self.out)
         with Counting() as progress:
             done = prepare(self.video, self.out, self.config, progress)
         for note in [*done.notes, *self._segments()]:
-            say(f"note: {note}")
+            say(note_line(note))
         say(f"note: {done.out / RECORD} holds the path of your video; delete it before you share the folder")
         say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
         if f"no {TOOLS_FOUND}" in read_description(done.out / "sequence.json").get("sources", {}).get("masks", ""):
@@ -109,7 +112,7 @@ class Poses(Command):
         with Counting() as progress:
             found = write_folder_path(self.data, self.poses, partial(progress, "following the camera"), reading=reading)
         for note in found.notes:
-            say(f"note: {note}")
+            say(note_line(note))
         if found.unexplained:
             say(f"note: no camera pose, or another scene, in frames {number_ranges(found.unexplained)}")
         if found.kept is not None:

@@ -11,7 +11,7 @@ from ..core.checks import input_error
 from ..system.console import say
 from .arguments import Command
 from .devices import Wanted, on_device
-from .paths import folder_of, open_scene, require_writable_folder, sequence_of, with_gaussians
+from .paths import folder_of, open_scene, require_writable_folder, sequence_of
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene
@@ -79,6 +79,7 @@ class Render(Command):
     def render(self, scene: RenderedScene) -> None:
         """Render the scene of `run` and print the output paths."""
         from ..model.highlights import without_highlights
+        from ..model.scene import with_gaussians
         from ..system.atomic import removed_on_failure
         from ..visualization.rendered_views import depth_span, read_path, sway_path, times_path, write_views
         from ..visualization.tissue_layers import SupportMap, write_support_film, write_texture_film

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
-from ..core.shell import changed_options, command
-from ..data.load import is_sequence
+from ..core.shell import changed_options, command, command_of
+from ..data.image_folders import beside
+from ..data.load import is_prepared
 from ..model.presets import preset, preset_names
 from ..prepare.config import PrepareConfig
+from ..prepare.notes import asks_for_action
 from ..system.console import say
 from .arguments import Command
 from .devices import Wanted, with_device
-from .paths import require_writable_folder
+from .paths import require_input_first, require_writable_folder
 from .progress import duration, step_head, step_progress
 from .train import require_gaussians
 
@@ -42,7 +44,7 @@ class Run(Command):
     """
 
     video: Path = field(metadata={"place": "VIDEO"})
-    """Video file, folder of images, or sequence folder, which is not prepared again."""
+    """Video file, folder of images and masks, or sequence folder, which is not prepared again."""
     out: Path = field(metadata={"place": "OUT"})
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
@@ -57,10 +59,12 @@ class Run(Command):
     """Seed of the training."""
     device: Wanted = "auto"
     """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
+    verbose: bool = False
+    """Print the notes that ask for no action too; OUT/notes.json has all of them."""
     config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
     examples = ("video.mp4 OUT --preview", "video.mp4 OUT", "stereo.mp4 OUT --calibration calib.yaml")
-    basics = "--preview --segment --all-segments --start --end --calibration --right --depth --masks --preset --device"
+    basics = "--preview --segment --all-segments --start --end --calibration --right --depth --masks --preset --verbose"
 
     def execute(self) -> int | None:
         """Do every step, with one progress display."""
@@ -73,32 +77,36 @@ class Run(Command):
         job = self.job(say)
         resumes = open_folder(job)
         say(_part_words(job) if isinstance(job, Job) else f"{job.source}: a sequence folder, trained as it is")
-        _do_steps(job, resumes=resumes)
+        _do_steps(job, resumes=resumes, verbose=self.verbose)
         say(f"\n{last_words(verdict_of(job), duration(clock.perf_counter() - began), job.player)}")
-        results = {"video": job.rendered_video, "report": job.report, "check": job.figure, "scene": job.run}
-        for what, path in results.items():
-            say(f"  {what:<8}{path}")
+        for line in result_lines(job):
+            say(f"  {line}")
         for line in filter(None, (problems(job), missed_tools_line(job.run, job.data))):
             say(line)
         say(f"To turn and measure it: `{command('view', job.run)}`")
-        if self.preview:
-            say("For the whole model, run the same command without --preview and with another OUT.")
+        say(
+            f"To see it in 3D Slicer: `{command('export', job.run, job.out / 'tissue.mrb')}`, and drop that file there."
+        )
+        if isinstance(job, Job) and job.is_preview:
+            whole = {name: words for name, words in job.options.items() if name != "--preview"}
+            say(f"The whole model: `{command_of('run', (self.video, beside(job.out, 'whole')), whole)}`")
 
     def job(self, tell: Callable[[str], None]) -> SequenceJob:
         """The job that the arguments ask for; `tell` takes the device that trains, and the reason."""
         from ..pipeline import SequenceJob, make_job
 
-        is_prepared = is_sequence(self.video)
+        require_input_first("run", self.video, self.out)
+        is_ready = is_prepared(self.video)
         chosen = ["--segment"] * bool(self.segment) + ["--all-segments"] * self.all_segments
         if chosen and (other := {"--start", "--end", "--stir"} & {*changed_options(self.config)}):
             raise input_error(chosen[0], f"no {min(other)}", f"{chosen[0]} and {min(other)}", "Remove one of them.")
-        if is_prepared and (useless := ["--preview"] * self.preview + chosen + list(changed_options(self.config))):
+        if is_ready and (useless := ["--preview"] * self.preview + chosen + list(changed_options(self.config))):
             fix = f"Remove {useless[0]}{', or use `--preset preview`' * self.preview}."
             raise input_error(useless[0], "a video to prepare", f"{self.video}, a sequence folder", fix)
         cfg = replace(preset("preview" if self.preview else self.preset), seed=self.seed)
         require_gaussians(cfg, "`endoprior prepare VIDEO DATA`, then `train`, `eval` and `render`.")
         cfg = with_device(cfg, self.device, tell)
-        if is_prepared:
+        if is_ready:
             return SequenceJob(self.video, self.out, cfg)
         return make_job(
             self.video, self.out, self.config, cfg, preset=self.preset, preview=self.preview, segment=self.segment
@@ -106,7 +114,7 @@ class Run(Command):
 
     def _run_all(self) -> int:
         """The segments one after the other, in folders of `out`; 1 if one failed."""
-        if is_sequence(self.video) or {"--start", "--end", "--stir"} & {*changed_options(self.config)}:
+        if is_prepared(self.video) or {"--start", "--end", "--stir"} & {*changed_options(self.config)}:
             self.job(say)  # says what contradicts
         require_writable_folder("OUT", self.out)
         from ..pipeline import Entry
@@ -125,7 +133,7 @@ class Run(Command):
         return do_all(entries, self.out, str(self.video))
 
 
-def _do_steps(job: SequenceJob, *, resumes: bool) -> None:
+def _do_steps(job: SequenceJob, *, resumes: bool, verbose: bool) -> None:
     """Say how long it will take, compile kernels if that was not done, and do the steps that are left."""
     from ..pipeline import (
         COMPILE,
@@ -165,7 +173,7 @@ def _do_steps(job: SequenceJob, *, resumes: bool) -> None:
                 else:
                     say(f"{step_head(names, step.name):<13} done before")
                     lines = notes_of(step, job)
-                for line in lines or []:
+                for line in shown_lines(lines or [], verbose=verbose):
                     say(f"     {line}")
     except KeyboardInterrupt:
         say("Stopped. To resume, run the same command again.")
@@ -177,17 +185,36 @@ def _part_words(job: Job) -> str:
     part = job.part
     seconds = part.num_frames / part.frames_per_second
     words = f"{job.source}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
+    words += " (its rate is unknown: set it with --folder-rate)" if job.rate_is_assumed else ""
     if not part.is_whole:
         words += f" from {part.start:g} s on (--start and --end choose another part)"
     return "\n".join([*(job.choice.words(job.source, job.out, job.options) if job.choice else []), words])
 
 
+def shown_lines(lines: Iterable[str], *, verbose: bool) -> list[str]:
+    """Of the lines of a step those to print: `verbose`, or all but the notes that ask for no action."""
+    return [line for line in lines if verbose or asks_for_action(line)]
+
+
 def last_words(verdict: Verdict | None, took: str, player: Path) -> str:
-    """How a run ended: a model that is wrong is not called done."""
-    if verdict is None:
-        return f"Done in {took}. Open {player} in a browser."
-    head = f"The model is wrong (after {took})" if verdict.word == "wrong" else f"Done in {took}"
-    return f"{head}. Open {player} in a browser.\nVerdict: {verdict}."
+    """How a run ended, what it is good for before all figures: a model that is wrong is not called done."""
+    plain = [f"{verdict.plain}."] if verdict and verdict.plain else []
+    head = f"The model is wrong (after {took})" if verdict and verdict.word == "wrong" else f"Done in {took}"
+    figures = [f"Verdict: {verdict}."] if verdict else []
+    return "\n".join([*plain, f"{head}. Open {player} in a browser.", *figures])
+
+
+def result_lines(job: SequenceJob) -> list[str]:
+    """What each result is."""
+    results = {
+        "report": (job.report, "held-out frames, their errors, curves and scores in one image"),
+        "video": (job.rendered_video, "input, rendered model and depth beside each other"),
+        "scene": (job.run, "the model itself, for `endoprior view` and `endoprior export`"),
+        "check": (job.figure, "what is suspicious in the video"),
+        "notes": (job.notes, "what each step decided"),
+    }
+    width = max(len(str(path)) for path, _ in results.values())
+    return [f"{name:<8}{path!s:<{width}}  {what}" for name, (path, what) in results.items()]
 
 
 def resume_words(names: list[str], waiting: list[str]) -> str:
@@ -245,5 +272,5 @@ def _tell(outcome: Outcome) -> None:
         return
     say(f"{entry.name}: done: {entry.job.out}")
     for step in steps_of(entry.job):
-        for line in notes_of(step, entry.job):
+        for line in shown_lines(notes_of(step, entry.job), verbose=False):
             say(f"     {line}")

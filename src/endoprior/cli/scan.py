@@ -30,13 +30,14 @@ class Scan(Command):
     """Video file, or folder of images."""
     out: Path = field(default=Path("scan.json"), metadata={"place": "OUT.json"})
     """File to write; the timeline goes beside it."""
-    folder_rate: float = 25.0
-    """Frame rate of a folder of images, 1/s."""
+    folder_rate: float | None = None
+    """Frame rate of a folder of images, 1/s; without it that of its sequence.json, else 25."""
 
     examples = ("video.mp4", "video.mp4 OUT.json")
 
     def __post_init__(self) -> None:
-        check_range("folder_rate", self.folder_rate, 0.01, 1000)
+        if self.folder_rate is not None:
+            check_range("folder_rate", self.folder_rate, 0.01, 1000)
 
     def execute(self) -> None:
         """Scan, write both files, and list the segments."""

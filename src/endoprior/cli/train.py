@@ -13,6 +13,7 @@ from ..core.config import Config
 from ..core.config_io import SHORT_NAMES
 from ..core.shell import command
 from ..data import load_sequence
+from ..data.load import not_trainable
 from ..model.method import method_of
 from ..model.presets import preset, preset_line, preset_names
 from ..runs.folder import config_of_run, read_config, sequence_of_run
@@ -21,6 +22,7 @@ from ..system.console import say
 from .arguments import Command, Parser, parse
 from .devices import Wanted, with_device
 from .evaluate import Eval, reject_missing_weights
+from .paths import require_input_first
 from .view import live_view
 
 
@@ -98,8 +100,12 @@ class Train(Command):
                 f"rates fall until {cfg.optim.decay_iterations:,}"
             )
         if not args.resume:
+            if args.out is not None:
+                require_input_first("train", args.data, args.out)
+            if args.config.data.format == "auto" and (error := not_trainable(args.data)):
+                raise error  # before kernels are compiled
             if args.out is None:
-                fix = "`endoprior train DATA RUN`."
+                fix = f"`{command('train', args.data, 'RUN')}`."
                 raise input_error("endoprior train", "the run folder to write after DATA", "nothing", fix)
             return args
         data, run = args.data, args.out or args.data
@@ -171,6 +177,10 @@ class Train(Command):
                 events.finish(scores, cfg.schedule.total)
             if line := missed_tools_line(out, self.data):
                 say(line)
+            if method_of(cfg).has_gaussians:
+                say(f"To turn and measure it: `{command('view', out)}`")
+            else:
+                say(f"To get images and a video: `{command('render', out)}`")
         except KeyboardInterrupt:
             say(f"Stopped; the trained scene is saved in {out}. To score it: `{command('eval', out)}`.")
             raise

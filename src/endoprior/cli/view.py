@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING
 from ..core.checks import input_error
 from ..core.shell import command
 from ..data import load_sequence
+from ..data.files import or_neighbor
 from ..data.reading import kind_of
 from ..system.console import say
 from .arguments import Command
 from .devices import Wanted, on_device
-from .paths import open_gaussians, sequence_if_there, with_gaussians
+from .paths import open_gaussians, sequence_if_there
 
 if TYPE_CHECKING:
     from ..training.trainer import Observer
-    from ..view.viewable import Viewable
+    from ..view.viewables import Viewable
 
 
 @dataclass
@@ -37,6 +38,8 @@ class View(Command):
     """Address to listen on. Other machines reach any but 127.0.0.1, without encryption."""
     port: int = 8080
     """Port to listen on; 0 uses any free port."""
+    allow_host: tuple[str, ...] = field(default=(), metadata={"metavar": "NAME"})
+    """Other names of this machine in the address of the page: that of a proxy which keeps it."""
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
@@ -44,12 +47,13 @@ class View(Command):
 
     def execute(self) -> None:
         """Serve until interrupted."""
-        from ..view.access_control import check_address, is_open
+        from ..view.access_control import check_address, check_names, is_open
         from ..view.server import Viewer
 
+        check_names(self.allow_host)
         check_address(self.host, self.port)
         viewable, out = open_viewable(self.path, self.data, self.device, highlights=self.highlights)
-        viewer = Viewer(viewable, host=self.host, port=self.port, out=out)
+        viewer = Viewer(viewable, host=self.host, port=self.port, out=out, names=self.allow_host)
         if is_open(self.host):
             say("--host: whoever learns the address below can see and change everything here; nothing is encrypted.")
         say(f"{viewable.title}: {viewer.url}  (Ctrl-C stops)")
@@ -95,9 +99,10 @@ def open_viewable(
         if not highlights:
             raise input_error("--no-highlights", "a run folder", f"{path}, a sequence", "Leave it out.")
         if kind_of(path) == "nothing":
-            fix = f"Correct the path, or make a run: `{command('train', 'DATA', path)}`."
+            fix = or_neighbor(f"Correct the path, or make a run: `{command('train', 'DATA', path)}`.", path)
             raise input_error(path, "a run folder or a sequence folder", "no such folder", fix)
         return ViewableSequence(load_sequence(path)), None
+    from ..model.scene import with_gaussians
     from ..view.viewable_scene import ViewableScene
 
     scene = open_gaussians(path)

@@ -10,6 +10,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from .parallel_kernels import parallel_njit
+
 _FAR = 1e30  # stands for infinity
 _LONG_RUN = 256  # points in one cell of the curve that call for a finer one
 _TINY = 1e-290  # smaller boxes get no curve: its scale would overflow
@@ -61,7 +63,7 @@ def _spread(v):
     return (v | (v << 2)) & 0x1249249249249249
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def _curve_keys(points, index_bits, axis_bits, keys):
     # Writes cell << index_bits | index for each point; cells are cubes, 2^axis_bits along the longest side.
     low, high = np.empty(3), np.empty(3)

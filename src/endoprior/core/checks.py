@@ -49,7 +49,13 @@ def similar_name(name: str, names: Sequence[str]) -> str | None:
     """The name with the same last part, such as `temporal.weight` for `weight`, else the most similar one, or None."""
     last = [re.split(r"\.|--", each)[-1] for each in (name, *names)]
     same = [each for each, part in zip(names, last[1:], strict=True) if part == last[0]]
-    return next(iter(same or difflib.get_close_matches(name, names, 1, 0.75)), None)
+    return next(iter(same or difflib.get_close_matches(name.lower(), names, 1, 0.75)), None)
+
+
+def or_did_you_mean(fix: str, name: str, names: Sequence[str], prefix: str = "") -> str:
+    """A fix, with its period, and the name that a mistyped one is most similar to, as it is typed after `prefix`."""
+    nearest = similar_name(name, names)
+    return f"{fix} Did you mean `{prefix}{nearest}`?" if nearest else fix
 
 
 def number_ranges(numbers: Iterable[int], most: int = 8) -> str:

@@ -1,8 +1,8 @@
 """What a user can turn, one frozen dataclass per concern: schema, defaults, command line and manual.
 
 The defaults are the preset `default`; `model/presets.py` says how the others differ. Numbers that have one value
-in all presets are constants beside their use. `config_deformation.py` has the fields of the deformation,
-`former_config.py` those of earlier versions. "mm" below means the unit of the sequence's depth.
+in all presets are constants beside their use. `config_deformation.py` has the fields of the deformation.
+"mm" below means the unit of the sequence's depth.
 
 The type of a field states its range. Values beyond it exhaust memory, loop for ever or give NaN, and config files may
 come from anywhere.
@@ -11,13 +11,12 @@ come from anywhere.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from .checks import InputError, check_range, input_error, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
-from .former_config import current_form
 from .ranges import Checked, Count, DecayedRate, Positive, Range, Rate, Share, Threshold, Weight
 
 OWN = "endoprior"
@@ -114,8 +113,6 @@ class LossConfig(Checked):
     """Weight per mm of the distance to the tracks of `init.motion flow`: higher holds tissue closer to them; 0: off."""
     trust_masks: bool = False
     """Tool masks are right. If not, and a program found them, what looks like a missed tool is left out."""
-    tool_margin: Literal["none", "measured"] = "none"
-    """`measured`: as many pixels around tools are left out as their color reaches beyond the masks, on this clip."""
 
 
 @dataclass(frozen=True)
@@ -266,11 +263,6 @@ class Config(Checked):
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
     released: ReleasedMethod = field(default_factory=ReleasedMethod)
-
-    @classmethod
-    def of_stored(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """The values of a stored config, those of an earlier version included, as this version names them."""
-        return current_form(values, {f.name for f in fields(cls)}, own=values.get("method", OWN) == OWN)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -27,6 +27,7 @@ IN_PROPORTION = (
     "temporal.start_iteration", "optim.decay_iterations",
 )  # fmt: skip
 """What keeps its share of the training when `iterations` changes, unless `schedule.literal`."""
+UNKNOWN_FIELD = "Correct the name, or use the version of endoprior that wrote it."
 FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
 
 
@@ -110,8 +111,7 @@ def _dotted_names(values: dict[str, Any], prefix: str = "") -> list[str]:
 def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     """Build a config dataclass from a nested dict. Unknown fields and wrong types are errors; missing ones default.
 
-    A class with `of_stored` knows fields of earlier versions too. Numbers must be finite, which Python's JSON reader
-    does not ask for.
+    Numbers must be finite, which Python's JSON reader does not ask for.
 
     Raises:
         InputError: names the field, the expected and the actual value.
@@ -119,18 +119,16 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     if not isinstance(values, dict):
         fix = "Use a file written by endoprior."
         raise input_error(where, "an object with fields", type(values).__name__, fix)
-    if of_stored := getattr(cls, "of_stored", None):
-        values = of_stored(values)
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType] - cls is a dataclass
     hints = {field.name: _hints(cls)[field.name] for field in fields}
     unknown = sorted(map(str, set(values) - set(hints)))
     if unknown:
         name = unknown[0] if unknown[0].isidentifier() else repr(unknown[0])
-        raise input_error(f"{where}.{name[:80]}", f"one of {', '.join(hints)}", "no such field", "Correct the name.")
+        raise input_error(f"{where}.{name[:80]}", f"one of {', '.join(hints)}", "no such field", UNKNOWN_FIELD)
     needed = [f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING]
     if missing := [name for name in needed if name not in values]:
         raise input_error(f"{where}.{missing[0]}", "an entry", "none", "add it.")
-    built = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
+    built = {name: value_of(hints[name], value, f"{where}.{name}") for name, value in values.items()}
     try:
         return cls(**built)
     except ValueError as error:
@@ -138,8 +136,8 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
         raise InputError(f"{where}: {error}{fix}") from error
 
 
-def _value(hint: Any, value: Any, where: str) -> Any:
-    """The value as its type wants it: lists become tuples, dicts dataclasses."""
+def value_of(hint: Any, value: Any, where: str) -> Any:
+    """The value as its type wants it: lists become tuples, dicts dataclasses. InputError about `where` otherwise."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is types.UnionType and any(map(dataclasses.is_dataclass, args)):
         if value is None:
@@ -151,9 +149,9 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     if not ok:
         raise input_error(where, want, _shown(value), "Correct the value.")
     if origin is tuple:
-        return tuple(_value(args[0], v, f"{where}[{i}]") for i, v in enumerate(value))
+        return tuple(value_of(args[0], v, f"{where}[{i}]") for i, v in enumerate(value))
     if origin is dict:
-        return {key: _value(args[1], v, f"{where}.{key}") for key, v in value.items()}
+        return {key: value_of(args[1], v, f"{where}.{key}") for key, v in value.items()}
     return value
 
 

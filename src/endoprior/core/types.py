@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+LEAST_ALPHA = 1e-10  # expected depth is divided by at least this
 SURE_DEPTH = 0.4  # confidence of a depth that counts as measured, see `Frame.depth_confidence`
 
 
@@ -107,9 +108,14 @@ class RenderedView:
     unclamped_color: Tensor
     """(H, W, 3) composited color; a little above 1 where bright Gaussians overlap."""
     depth: Tensor
-    """(H, W) sum of weight * z, mm; divide by alpha for the expected depth."""
+    """(H, W) sum of weight * z, mm: too near where alpha is below 1; see `expected_depth`."""
     alpha: Tensor
     """(H, W) accumulated opacity in [0, 1)."""
+
+    @property
+    def expected_depth(self) -> Tensor:
+        """(H, W) mean z of what is seen, mm: `depth` divided by alpha; 0 where alpha is 0."""
+        return self.depth / self.alpha.clamp(min=LEAST_ALPHA)
 
     @property
     def color(self) -> Tensor:

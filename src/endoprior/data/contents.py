@@ -6,23 +6,23 @@ import hashlib
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from ..core.checks import input_error
-from ..core.types import Frame
-from ..system.memory import workers
-from .reading import reading
-
-if TYPE_CHECKING:
-    from .sequence import FrameSequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from ..footage.components import square
+from ..core.checks import input_error
+from ..core.types import Frame
+from ..footage.components import Image, Mask, square
 from ..footage.dark_outline import brightness
+from ..system.memory import workers
+from .image_folders import has_depth, how_to_add_depth
+from .reading import reading
+
+if TYPE_CHECKING:
+    from .sequence import FrameSequence
 
 DECODING_BYTES = 40  # memory per pixel while a frame is read
 TOOL_FRACTION_WARNING = 0.6  # with a larger share of tool pixels, the mask is probably inverted
@@ -59,26 +59,34 @@ def fingerprint_of(files: Sequence[Path], folder: Path) -> str:
 def remarks_on(sequence: FrameSequence, decoded: Callable[[int], Frame]) -> list[str]:
     """What is unusual but usable in the frames, one line each; InputError if they cannot be trained on."""
 
-    def contents(index: int) -> tuple[float, bool, bool]:
-        """Share of tissue; whether any pixel has depth; whether any tissue pixel has depth."""
+    def contents(index: int) -> tuple[float, bool, int, int]:
+        """Share of tissue; whether any pixel has depth; how many tissue pixels have depth, and a color besides."""
         frame = decoded(index)
         measured = frame.depth_valid & frame.tissue_mask
-        return float(frame.tissue_mask.mean()), bool(frame.depth_valid.any()), bool(measured.any())
+        colored = measured & ~is_saturated(frame.rgb_u8)
+        num_measured, num_colored = int(np.count_nonzero(measured)), int(np.count_nonzero(colored))
+        return float(frame.tissue_mask.mean()), bool(frame.depth_valid.any()), num_measured, num_colored
 
     camera, count = sequence.camera(0), len(sequence)
     masks, depth = sequence.path / sequence.mask_name, sequence.path / "depth"
     with ThreadPoolExecutor(workers(DECODING_BYTES * camera.width * camera.height)) as pool:
         # Decoding releases the interpreter lock.
-        tissue, with_depth, with_both = zip(*pool.map(contents, range(count)), strict=True)
+        tissue, with_depth, with_both, colored = zip(*pool.map(contents, range(count)), strict=True)
     if not any(tissue):
         hint = "the polarity may be inverted: masks are 255 on tools."
         raise input_error(masks, "tissue in at least one frame", "tool everywhere", hint)
     if not any(with_depth):
-        hint = "provide depth in mm, 0 where it is missing."
-        raise input_error(depth, "depth > 0 in at least one frame", "0 everywhere", hint)
-    if not any(with_both[index] for index in sequence.indices("train")):
+        got = "0 everywhere" if has_depth(sequence.path) else "none"
+        raise input_error(depth, "depth > 0 in at least one frame", got, how_to_add_depth(sequence.path))
+    train = sequence.indices("train")
+    if not any(with_both[index] for index in train):
         hint = "the mask's polarity may be inverted, or the depth may be of the tool only."
         raise input_error(depth, "depth on tissue in a training frame", "none", hint)
+    share = sum(colored[index] for index in train) / sum(with_both[index] for index in train)
+    if share < LEAST_COLORED:
+        want = f"a level below {SATURATED} of 255 on at least {LEAST_COLORED:.0%} of the tissue in the training frames"
+        hint = "export the images again, with all values from 0 to 255 in use, or choose a darker part of the video."
+        raise input_error(sequence.path, want, f"{share:.1%}: the images are white", hint)
     remarks = list(sequence.remarks)
     if (tool := 1 - sum(tissue) / count) > TOOL_FRACTION_WARNING:
         remarks.append(f"{masks}: {tool:.0%} of all pixels are masked; the polarity may be inverted")
@@ -91,18 +99,33 @@ def remarks_on(sequence: FrameSequence, decoded: Callable[[int], Frame]) -> list
     return remarks
 
 
-SATURATED = 250  # a pixel is saturated, and says nothing of the tissue, if its smallest channel reaches this level
+SATURATED = 250  # a pixel is saturated if its smallest channel reaches this level: its color is at least as bright
 SATURATED_SHARE = 0.02  # least share of tissue that is, else it is the usual highlights, which are to be modelled
+LEAST_COLORED = 0.01  # with a smaller share of the tissue that is not saturated, there is nothing to train on
 GLARE_PX = 2  # so far around saturated pixels their light spreads
+GLARE_WEIGHT = 0.5
+"""How far such pixels are believed beside others. Other frames may show the true color; but what no frame shows better
+needs a color, else there is a hole, and with far less what is white most of the time becomes dark."""
+
+
+def overexposed(frame: Frame) -> Mask | None:
+    """(H, W) True on saturated tissue; None where that is no more than the usual highlights."""
+    saturated = is_saturated(frame.rgb_u8) & frame.tissue_mask
+    glares = np.count_nonzero(saturated) > SATURATED_SHARE * max(np.count_nonzero(frame.tissue_mask), 1)
+    return saturated if glares else None
+
+
+def is_saturated(rgb_u8: Image) -> Mask:
+    """(H, W) True where an image (H, W, 3) is saturated."""
+    return ~brightness(~rgb_u8) >= SATURATED
 
 
 def weighted(frame: Frame, weight: float) -> Frame:
-    """The frame with its weight on every pixel, and with 0 where much of it is saturated; itself where all are 1."""
-    saturated = (~brightness(~frame.rgb_u8) >= SATURATED) & frame.tissue_mask
-    glares = np.count_nonzero(saturated) > SATURATED_SHARE * max(np.count_nonzero(frame.tissue_mask), 1)
-    if weight == 1 and not glares:
+    """The frame with its weight on every pixel, and less where it is overexposed; itself where all are 1."""
+    saturated = overexposed(frame)
+    if weight == 1 and saturated is None:
         return frame
     believed = np.full(frame.tissue_mask.shape, weight, np.float32)
-    if glares:
-        believed[cv2.dilate(saturated.astype(np.uint8), square(GLARE_PX)) > 0] = 0
+    if saturated is not None:
+        believed[cv2.dilate(saturated.astype(np.uint8), square(GLARE_PX)) > 0] *= GLARE_WEIGHT
     return replace(frame, weight=believed)

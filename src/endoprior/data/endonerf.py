@@ -21,7 +21,7 @@ from .assemble import Pixels, assemble, kept_frames
 from .description import frame_weights, intrinsics_of, read_description
 from .files import CONFIDENCE, IMAGE_SUFFIXES, list_files, read_json
 from .formats import Format
-from .frame_files import Kind, files_of_images, one_per_frame
+from .frame_files import Kind, files_of_images, missing_numbers, one_per_frame
 from .images import (
     DEPTH_SUFFIXES,
     decode_image,
@@ -71,7 +71,8 @@ def load_endonerf(
     images, note = one_per_frame(path / "images", list_files(path / "images", kinds, layout), "images")
     if len(images) < 2:
         raise input_error(path / "images", "at least 2 frames, 1 to train and 1 to test", "1", "add frames.")
-    remarks += [note] if note else []
+    missing = missing_numbers(images)
+    remarks += [each for each in (note, missing and f"{path / 'images'}: {missing}") if each]
 
     def column(name: str, kind: Kind, suffixes: tuple[str, ...], required: bool, missing: str) -> dict[int, Path]:
         """The file of each image in a folder."""

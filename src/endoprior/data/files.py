@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from string import ascii_lowercase, ascii_uppercase
+from typing import Any, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError, input_error
+from ..core.checks import InputError, input_error, similar_name
+from ..core.config_io import value_of
+from ..core.shell import quoted
 from .reading import ACCESS_HINT, read_text
 
 DECIMAL = re.compile(r"[0-9]+(?:\.[0-9]+)?")
+LETTERED, ALPHABETS = re.compile("#[A-Za-z]$"), (ascii_lowercase, ascii_uppercase)
 # What a file holds, by a word of its name: a mask, a depth map, or something else that is no frame.
 MASK_WORDS = {
     "mask", "masks", "msk", "seg", "segm", "segmentation", "label", "labels", "annotation", "annotations", "watershed",
@@ -39,23 +44,28 @@ def bare(stem: str) -> str:
 
 
 def sorting_keys(stems: Sequence[str]) -> list[list[int | str] | tuple[str, float, str]]:
-    """A key for each name, for the natural order: runs of digits are numbers, 2 before 10.
+    """A key for each name, for the natural order: runs of digits are numbers, 2 before 10, and -2 before -1.
 
-    Where the last numbers are decimals, as times in seconds are, they compare as such: 0.04 before 0.2.
+    Capitals do not count. Where the last numbers are decimals, as times in seconds are, they compare as such: 0.04
+    before 0.2.
     """
+    stems = _without_plus([stem.casefold() for stem in stems])
+    below = _below_zero(stems)
     if _are_decimals(stems):
-        found = [list(DECIMAL.finditer(stem))[-1] for stem in stems]
-        return [(m.string[: m.start()], float(m[0]), m.string[m.end() :]) for m in found]
-    # Splitting at digits alternates text and number, so that equal positions always compare.
-    return [[int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", stem))] for stem in stems]
+        parts = [_around_last(stem) for stem in stems]
+        return [
+            (head[:-1], -float(number), tail) if i in below else (head, float(number), tail)
+            for i, (head, number, tail) in enumerate(parts)
+        ]
+    return [_split(stem, i in below) for i, stem in enumerate(stems)]
 
 
 def numbers_of(stems: Sequence[str]) -> list[float] | None:
     """The number of each name: the last run of digits that differs in all, or a decimal; None if there is none."""
     if _are_decimals(stems):
-        columns = [[float(DECIMAL.findall(stem)[-1]) for stem in stems]]
+        columns = [[float(key[1]) for key in sorting_keys(stems)]]
     else:
-        rows = [[int(digits) for digits in re.findall("[0-9]+", stem)] for stem in stems]
+        rows = [[part for part in key if isinstance(part, int)] for key in sorting_keys(stems)]
         if not all(rows):
             return None
         even = len({len(row) for row in rows}) == 1
@@ -63,9 +73,73 @@ def numbers_of(stems: Sequence[str]) -> list[float] | None:
     return next(([float(number) for number in column] for column in columns if len(set(column)) == len(column)), None)
 
 
-def pattern_of(stem: str) -> str:
-    """A name with `#` in place of each number, the same for all files of a series."""
-    return DECIMAL.sub("#", stem)
+def patterns_of(stems: Sequence[str]) -> list[str]:
+    """Each name with `#` in place of each number, the same for all files of a series.
+
+    A sign, and letters that count on within a number (1a, 1b, 2a), belong to the number.
+    """
+    stems = _without_plus(stems)
+    below = _below_zero(stems)
+    patterns = [DECIMAL.sub("#", stem) for stem in stems]
+    patterns = ["#".join(p.rsplit("-#", 1)) if i in below else p for i, p in enumerate(patterns)]
+    letters: dict[str, set[str]] = {}
+    for pattern in patterns:
+        if LETTERED.search(pattern):
+            letters.setdefault(pattern[:-1], set()).add(pattern[-1])
+    counting = {before for before, found in letters.items() if _count_on(found)}
+    return [pattern[:-1] if LETTERED.search(pattern) and pattern[:-1] in counting else pattern for pattern in patterns]
+
+
+def _count_on(letters: set[str]) -> bool:
+    """Whether letters are the first ones of the alphabet, at least a and b: not L and R."""
+    return len(letters) > 1 and any("".join(sorted(letters)) == all_of[: len(letters)] for all_of in ALPHABETS)
+
+
+def _around_last(stem: str) -> tuple[str, str, str]:
+    """What stands before the last number of a name, which may be a decimal; the number; what stands behind it."""
+    number = list(DECIMAL.finditer(stem))[-1]
+    return stem[: number.start()], number[0], stem[number.end() :]
+
+
+def _split(stem: str, is_below: bool) -> list[int | str]:
+    """Text and numbers in turn, so that equal positions always compare; the sign of the last number is in it."""
+    if not is_below:
+        return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", stem))]
+    head, number, tail = _around_last(stem)
+    negative = [-part if isinstance(part, int) else part for part in _split(number + tail, False)]
+    return [*_split(head[:-1], False), *negative[1:]]
+
+
+def _without_plus(stems: Sequence[str]) -> list[str]:
+    """The names without the sign of numbers above 0, where others of the series have that of numbers below: -1, +1."""
+    parts = [_around_last(stem) if DECIMAL.search(stem) else (stem, "", "") for stem in stems]
+    signed = {(head[:-1], tail) for head, _, tail in parts if head.endswith("-")}
+    return [
+        head[:-1] + number + tail if head.endswith("+") and (head[:-1], tail) in signed else stem
+        for stem, (head, number, tail) in zip(stems, parts, strict=True)
+    ]
+
+
+def _below_zero(stems: Sequence[str]) -> set[int]:
+    """Positions of the names whose last number is below 0.
+
+    A hyphen before it is a sign, and no separator, where other names go on from 0 without it: -2, -1, 0, 1.
+    """
+    series: dict[tuple[str, str], tuple[dict[int, float], dict[int, float]]] = {}
+    for i, stem in enumerate(stems):
+        if DECIMAL.search(stem):
+            head, number, tail = _around_last(stem)
+            with_hyphen = head.endswith("-")
+            series.setdefault((head.removesuffix("-"), tail), ({}, {}))[with_hyphen][i] = float(number)
+    return {i for above, below in series.values() if _goes_on(above.values(), below.values()) for i in below}
+
+
+def _goes_on(above: Collection[float], below: Collection[float]) -> bool:
+    """Whether numbers from 0 on continue others, given without their sign, as evenly as these follow each other."""
+    if not above or not below or 0 in below:
+        return False
+    steps = [b - a for part in (above, below) for a, b in pairwise(sorted({*part}))]
+    return 0 in above or (bool(steps) and min(above) + min(below) <= max(steps) + 1e-9)
 
 
 def _are_decimals(stems: Sequence[str]) -> bool:
@@ -86,11 +160,22 @@ def entries(folder: Path) -> list[Path]:
         raise input_error(folder, "a readable folder", error.strerror or str(error), ACCESS_HINT) from None
 
 
+def or_neighbor(fix: str, path: Path) -> str:
+    """A fix, with its period, and the entry beside a path that is not there whose name is most similar, if any."""
+    try:
+        names = [entry.name for entry in path.parent.iterdir()]
+    except OSError:
+        return fix
+    same = [name for name in names if name.lower() == path.name.lower()]
+    nearest = next(iter(same), None) or similar_name(path.name, names)
+    return f"{fix} Did you mean `{quoted(path.with_name(nearest))}`?" if nearest else fix
+
+
 def in_order(files: Iterable[Path]) -> list[Path]:
     """The files of a folder in natural order of their names: 2 before 10, and 0.04 before 0.2 where they are times."""
     listed = list(files)
     keys = sorting_keys([file.stem for file in listed])
-    return [listed[i] for i in sorted(range(len(listed)), key=lambda i: (keys[i], listed[i].suffix))]
+    return [listed[i] for i in sorted(range(len(listed)), key=lambda i: (keys[i], listed[i].suffix, listed[i].name))]
 
 
 def files_with(folder: Path, suffixes: tuple[str, ...], ending: str = "") -> list[Path]:
@@ -115,6 +200,17 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
     raise input_error(folder, f"{kind} files", got, f"put one {kind} per frame there.")
 
 
+def portable(name: str) -> str:
+    """A relative path that a file names, with / between its parts: programs on Windows write a backslash."""
+    return name.replace("\\", "/")
+
+
+def named_file(folder: Path, name: str) -> Path:
+    """The file below a folder that another file names. Elsewhere than on Windows, a name may hold a backslash."""
+    literal = folder / name
+    return literal if "\\" not in name or literal.exists() else folder / portable(name)
+
+
 def read_json(
     path: Path, fix: str = "correct it or remove it.", expected: str = "a JSON object", kind: type = dict
 ) -> Any:
@@ -128,6 +224,35 @@ def read_json(
     if not isinstance(stored, kind):
         raise input_error(path, expected, type(stored).__name__, fix)
     return stored
+
+
+def read_own(path: Path, hint: Any, fix: str) -> Any:
+    """The contents of a JSON file that this program wrote, of a type as `core.config_io.value_of` takes it.
+
+    Another version, another program or a disk may have changed it: it is checked as if a stranger had written it.
+    """
+    is_list = get_origin(hint) is tuple
+    stored = read_json(path, fix, "a JSON list" if is_list else "a JSON object", list if is_list else dict)
+    return of_type(path, hint, stored, "file", fix)
+
+
+def read_parts(path: Path, parts: Mapping[str, Any], fix: str) -> dict[str, Any]:
+    """As `read_own`, of an object that has these parts, each of its type, and others, which are not looked at."""
+    stored = read_json(path, fix)
+    for name, hint in parts.items():
+        if name not in stored:
+            raise input_error(path, f"an entry {name}", "none", fix)
+        stored[name] = of_type(path, hint, stored[name], name, fix)
+    return stored
+
+
+def of_type(path: Path, hint: Any, value: Any, where: str, fix: str) -> Any:
+    """The value that was found somewhere in a file, of that type; InputError about the file."""
+    try:
+        return value_of(hint, value, where)
+    except InputError as error:
+        problem = str(error).split(". Fix: ")[0]
+        raise InputError(f"{path}: {problem}. Fix: {fix[:1].upper()}{fix[1:]}") from None
 
 
 def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -15,10 +15,11 @@ from typing import Any, Literal
 import numpy as np
 
 from ..core.checks import input_error
-from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, bare, files_with, numbers_of, pattern_of, words_of
+from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, bare, files_with, numbers_of, patterns_of, words_of
 
 Kind = Literal["images", "masks", "depth"]
 HINT = "Add the missing files, or name each file by its frame number."
+GAP = 1.5  # numbers are missing where two files are further apart than so many times the usual step
 BY_NAME, BY_NUMBER = "matched by name", "matched by the numbers in the names"
 COUNTED = "matched in order, their numbers are counted otherwise"
 
@@ -50,8 +51,8 @@ class Series:
 def one_per_frame(folder: Path, files: Sequence[Path], kind: Kind) -> tuple[list[Path], str]:
     """The files of one kind where a folder has several of a frame, else all; and a note on those left out, or none."""
     found: dict[str, list[Path]] = {}
-    for file in files:
-        found.setdefault(pattern_of(file.stem) + file.suffix.lower(), []).append(file)
+    for file, pattern in zip(files, patterns_of([file.stem for file in files]), strict=True):
+        found.setdefault(pattern + file.suffix.lower(), []).append(file)
     every = [Series(name, tuple(each)) for name, each in found.items()]
     if not _overlap(every):
         return list(files), ""
@@ -68,9 +69,31 @@ def one_per_frame(folder: Path, files: Sequence[Path], kind: Kind) -> tuple[list
     return [file for file in files if file in kept], note
 
 
+def missing_numbers(files: Sequence[Path]) -> str:
+    """A note on numbers that a series of files, in order, leaves out, or none: time passes there without an image.
+
+    The usual step may be any, as in every fifth frame. Times as names, which are a little uneven, leave out nothing.
+    """
+    numbers = numbers_of([file.stem for file in files])
+    steps = np.diff(numbers or [])
+    if not len(steps) or steps.min() <= 0:
+        return ""
+    usual = float(np.percentile(steps, 50, method="lower"))
+    gaps = np.flatnonzero(steps > GAP * usual)
+    if not len(gaps):
+        return ""
+    count, (before, after) = int(np.round(steps[gaps] / usual - 1).sum()), files[gaps[0] : gaps[0] + 2]
+    more = f", and in {len(gaps) - 1} more places" if len(gaps) > 1 else ""
+    where = f"between {before.name} and {after.name}{more}"
+    return f"{count} numbers are missing, {where}; the files count as evenly spaced in time"
+
+
 def _overlap(series: Sequence[Series]) -> bool:
     """Whether two series have files of the same frames."""
+    every = [file.name.casefold() for each in series for file in each.files]
     several = [each for each in series if len(each.files) > 1]
+    if len(set(every)) < len(every):
+        return True
     if any(a.shows_frames_of(b) for i, a in enumerate(several) for b in several[:i]):
         return True
     names = [bare(file.stem) for each in series if len(each.files) == 1 for file in each.files]

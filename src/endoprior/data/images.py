@@ -8,7 +8,6 @@ readers raise InputError for a file that is unreadable, of another kind or of an
 from __future__ import annotations
 
 import io
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,10 +31,11 @@ READERS = {b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImage
 TIFF_STARTS = (b"II", b"MM")  # the order of bytes in a number. Pillow's own reader knows fewer kinds of pixels
 BIG_TIFF = 43
 JPEG_END, PNG_END = b"\xff\xd9", b"IEND\xaeB`\x82"
-TURNED = range(5, 9)  # orientations that exchange width and height
+TURNED = range(5, 9)  # orientations, as EXIF counts them, that exchange width and height
+MIRRORED = (2, 4, 5, 7)
+SILENT = 0  # OpenCV: LOG_LEVEL_SILENT
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
 Size = tuple[int, int]
-warnings.filterwarnings("ignore", module=r"PIL\.\w+Plugin")  # of damaged tags, which are read as missing
 
 
 class ImageHeader(NamedTuple):
@@ -86,6 +86,12 @@ def _read_by_pillow(encoded: bytes) -> tuple[Size, int | None]:
         return image.size, None
 
 
+def _silence_opencv() -> None:
+    """OpenCV writes nothing to stderr; the function has one name in OpenCV 4 and another in OpenCV 5."""
+    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    set_level(SILENT)
+
+
 def decode_image(path: Path, size: Size | None, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray:
     """Decode a PNG, JPEG, TIFF, BMP or WebP file; `flags` of `cv2.imdecode`: as stored, or converted.
 
@@ -98,7 +104,7 @@ def decode_image(path: Path, size: Size | None, flags: int = cv2.IMREAD_UNCHANGE
     if header and header.width * header.height > MOST_PIXELS:
         got = f"{header.width}x{header.height} px in its header"
         raise input_error(path, f"an image of at most {MOST_PIXELS // 1_000_000} Mpx", got, "scale it down.")
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
+    _silence_opencv()  # the error below replaces its messages
     try:
         pixels = cv2.imdecode(encoded, flags | cv2.IMREAD_IGNORE_ORIENTATION) if header else None
     except cv2.error:
@@ -107,12 +113,13 @@ def decode_image(path: Path, size: Size | None, flags: int = cv2.IMREAD_UNCHANGE
         got = f"{encoded.size} bytes that cannot be decoded"
         raise input_error(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "write the file again.")
     if not data.startswith(TIFF_STARTS):  # OpenCV turns TIFF whatever it is told
-        pixels = _upright(pixels, header.orientation)
+        pixels = upright(pixels, header.orientation)
     _demand_size(path, pixels, size)
     return pixels
 
 
-def _upright(pixels: NDArray, orientation: int) -> NDArray:
+def upright(pixels: NDArray, orientation: int) -> NDArray:
+    """Stored pixels (H, W, ...) as they are shown, by their EXIF orientation, 1 to 8."""
     if orientation in TURNED:
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -162,13 +169,12 @@ def read_share(path: Path, size: Size | None = None) -> NDArray[np.float32]:
 def read_depth(path: Path, scale: float = 1.0, size: Size | None = None) -> NDArray[np.float32]:
     """(H, W) depth, mm, of an 8-bit or 16-bit image, gray or with equal channels; `scale` is mm per unit of the file.
 
-    It is 0 where the file has 0, and with 16 bits what else stands for missing (`is_measured`).
+    It is 0 where the file has 0, or what else stands for missing (`is_measured`).
     """
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype not in (np.uint8, np.uint16):
         raise input_error(path, "an 8-bit or 16-bit depth image", describe_pixels(pixels), "save it as 16-bit PNG.")
-    depth = pixels.astype(np.float32) * np.float32(scale)
-    return depth if pixels.dtype == np.uint8 else np.where(is_measured(pixels), depth, np.float32(0))
+    return np.where(is_measured(pixels), pixels.astype(np.float32) * np.float32(scale), np.float32(0))
 
 
 def read_depth_file(
@@ -272,7 +278,7 @@ def encode_png(pixels: NDArray, compression: int = 1) -> bytes:
 
     MemoryError if the encoder stopped: libpng has no other reason with pixels of these types.
     """
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
+    _silence_opencv()  # the error below replaces its messages
     stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
     done, encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])
     if not done or not (data := encoded.tobytes()).endswith(PNG_END):

@@ -6,20 +6,30 @@ import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from ..core.checks import InputError, input_error, number_ranges, read_ranges
+from ..core.checks import InputError, input_error, number_ranges, or_did_you_mean, read_ranges
 from ..core.config import DataConfig
 from ..core.shell import command, quoted
 from .endonerf import load_endonerf
-from .files import entries, read_json
+from .files import entries, or_neighbor, read_json
 from .formats import REGISTRY, recognizing
+from .image_folders import (
+    beside,
+    contents_of,
+    how_to_add_depth,
+    image_folders,
+    is_footage,
+    needs_depth,
+    ways_to_prepare,
+)
 from .reading import kind_of
 from .sequence import FrameSequence
-from .video_files import STILL_SUFFIXES, VIDEO_SUFFIXES, is_video
+from .video_files import VIDEO_SUFFIXES, is_video
 
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
 CALIBRATIONS = (".ini", ".yaml", ".yml", ".npz")
@@ -41,6 +51,14 @@ def load_sequence(
     Raises:
         InputError: the folder is not a sequence; the message names the file, what is expected, what is there and a fix.
         ValueError: unknown `pose_axes`, or `opengl` for another layout.
+
+    Example:
+        >>> import endoprior
+        >>> sequence = endoprior.load_sequence("DATA")
+        >>> sequence
+        FrameSequence('DATA': 10 frames (8 train, 2 test), 64x48, 15 frames per second, depth in mm)
+        >>> sequence[0].rgb.shape, len(sequence.frames("test"))
+        ((48, 64, 3), 2)
     """
     if pose_axes not in ("opencv", "opengl"):
         raise ValueError(f"pose_axes must be opencv or opengl; got {pose_axes!r}")
@@ -50,7 +68,8 @@ def load_sequence(
         if error := not_a_sequence(path):
             raise error
         got = "no such folder" if kind == "nothing" else kind
-        raise input_error(path, "a sequence folder", got, "pass the folder that holds images/, masks/ and depth/.")
+        fix = "pass the folder that holds images/, masks/ and depth/."
+        raise input_error(path, "a sequence folder", got, or_neighbor(fix, path) if kind == "nothing" else fix)
     name = find_format(path, cfg)
     if pose_axes == "opencv":
         sequence = REGISTRY.load(name).load(path, cfg)
@@ -67,7 +86,7 @@ def load_sequence(
             raise input_error("data.window", expected, cfg.window, "correct it, or leave it out for all frames.")
         sequence = sequence.part(frames[0], frames[-1] + 1)
     _use_reliability(sequence, cfg)
-    sequence.reading = cfg
+    sequence.reading, sequence.read_again = cfg, partial(load_sequence, path, pose_axes=pose_axes)
     return sequence
 
 
@@ -95,7 +114,8 @@ def find_format(path: Path, cfg: DataConfig) -> str:
     if cfg.format != "auto":
         if cfg.format in REGISTRY.names():
             return cfg.format
-        raise input_error("data.format", f"one of auto, {known}", repr(cfg.format), "see docs/datasets.md.")
+        fix = or_did_you_mean("see docs/datasets.md.", cfg.format, REGISTRY.names())
+        raise input_error("data.format", f"one of auto, {known}", repr(cfg.format), fix)
     if name := recognizing(path):
         return name
     if error := not_a_sequence(path):
@@ -113,6 +133,18 @@ def is_sequence(folder: Path) -> bool:
         return False
 
 
+def is_prepared(folder: Path) -> bool:
+    """Whether a folder is a sequence that can be trained on as it is; images without depth are to be prepared."""
+    return is_sequence(folder) and not needs_depth(folder)
+
+
+def is_input(path: Path) -> bool:
+    """Whether a model can be made of a path: a video, footage, or a sequence folder; results of ours are none."""
+    if kind_of(path) == "a folder":
+        return not (is_run(path) or is_run(path / "run")) and (is_sequence(path) or is_footage(path))
+    return kind_of(path) == "a file" and is_video(path)
+
+
 def is_run(folder: Path) -> bool:
     """Whether `train` wrote a folder."""
     return (folder / "config.json").is_file() and any((folder / name).exists() for name in (*RUN_FILES, WINDOWS))
@@ -123,14 +155,33 @@ def not_a_sequence(path: Path) -> InputError | None:
     kind = kind_of(path)
     found = None
     if kind == "a folder":
-        found = _folder(path)
+        found = what_is_in(path)
     elif kind == "a file" and path.suffix.lower() in ARCHIVES:
         found = "an archive", "unpack it and pass the folder."
     elif kind == "a file" and path.name in RUN_FILES:
         found = "a file of a run", f"`{command('view', path.parent)}`, or pass the sequence folder of the run."
     elif kind == "a file" and is_video(path):
-        found = "a video", f"{_prepare(path)}."
+        found = "a video", f"{ways_to_prepare(path)}."
     return input_error(path, "a sequence folder", *found) if found else None
+
+
+def not_trainable(path: Path) -> InputError | None:
+    """The error for footage that is to be prepared first, and what else leads to a sequence folder; None for others."""
+    if is_sequence(path) and needs_depth(path):
+        return input_error(path, "a sequence folder", "images without depth", how_to_add_depth(path))
+    return None if is_sequence(path) else not_a_sequence(path)
+
+
+def not_to_prepare(path: Path) -> InputError | None:
+    """The error for a sequence folder that can be trained on, where `prepare` expects footage; None for others."""
+    found = contents_of(path)
+    if found is None or found.images == path or not is_prepared(path):
+        return None
+    again = command(
+        "prepare", found.images, "OUT", *(word for masks in found.mask_folders[:1] for word in ("--masks", masks))
+    )
+    fix = f"`{command('train', path, 'RUN')}`; to prepare its images again: `{again}`."
+    return input_error(path, "a video, or images without depth and poses", "a sequence folder", fix)
 
 
 def not_a_run(path: Path) -> InputError | None:
@@ -139,19 +190,19 @@ def not_a_run(path: Path) -> InputError | None:
     what = fix = ""
     if kind == "nothing":
         what = f"no such {'file' if path.name == RUN_FILES[0] else 'folder'}"
-        fix = f"Correct the path, or make a run: `{command('train', 'DATA', path)}`."
-    elif kind == "a folder" and is_sequence(path):
+        fix = or_neighbor(f"Correct the path, or make a run: `{command('train', 'DATA', path)}`.", path)
+    elif kind == "a folder" and is_prepared(path):
         what, fix = "a sequence folder", f"`{command('train', path, 'RUN')}`, then pass RUN."
     elif kind == "a folder" and is_run(path / "run"):
         what, fix = "a folder with a run in it", f"pass {quoted(path / 'run')}."
-    elif (kind == "a file" and is_video(path)) or (kind == "a folder" and not is_run(path) and _has_images(path)):
-        what, out = "a video" if kind == "a file" else "a folder of images", _beside(path, "out")
+    elif (kind == "a file" and is_video(path)) or (kind == "a folder" and not is_run(path) and contents_of(path)):
+        what, out = "a video" if kind == "a file" else "a folder of images", beside(path, "out")
         fix = f"`{command('run', path, out)}`, then pass {quoted(out / 'run')}."
     return input_error(path, "a run folder", what, fix) if what else None
 
 
-def _folder(path: Path) -> tuple[str, str] | None:
-    """What a folder is, and the fix; None if it is not recognized."""
+def what_is_in(path: Path) -> tuple[str, str] | None:
+    """What a folder is that is no sequence, and the fix; None if it is not recognized."""
     if is_run(path):
         return "a run folder", _fix_of_run(path)
     parent = Path(os.path.abspath(path)).parent
@@ -166,16 +217,17 @@ def _folder(path: Path) -> tuple[str, str] | None:
             return "a folder with a sequence and a run in it", f"{fix}; the run is {quoted(path / 'run')}."
         return "a folder with one sequence folder in it", f"{fix}."
     videos = [entry for entry in inside if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
+    lenses = [entry for entry in inside if entry.suffix.lower() in CALIBRATIONS]
+    lenses += [entry for entry in inside if entry.suffix == ".json" and "calib" in entry.name.lower()]
     if len(videos) == 1:
-        return "a folder with a video", f"{_prepare(videos[0])}."
-    for what, paths in (("videos", videos), ("image folders", [each for each in folders if _has_images(each)])):
+        lens = ["--calibration", lenses[0]] if len(lenses) == 1 else []
+        return "a folder with a video", f"{ways_to_prepare(videos[0], *lens)}."
+    for what, paths in (("videos", videos), ("image folders", image_folders(path))):
         if pair := _pair(paths):
-            files = [entry for entry in inside if entry.suffix.lower() in CALIBRATIONS]
-            files += [entry for entry in inside if entry.suffix == ".json" and "calib" in entry.name.lower()]
-            calibration = files[0] if len(files) == 1 else "FILE"
-            fix = _prepare(pair[0], "--right", pair[1], "--calibration", calibration)
+            calibration = lenses[0] if len(lenses) == 1 else "FILE"
+            fix = ways_to_prepare(pair[0], "--right", pair[1], "--calibration", calibration)
             return f"{what} of two cameras", f"{fix}."
-    return ("a folder of images", f"{_prepare(path)}.") if not sequences and _has_images(path) else None
+    return ("a folder of images", f"{ways_to_prepare(path)}.") if not sequences and is_footage(path) else None
 
 
 def _fix_of_run(path: Path) -> str:
@@ -189,30 +241,9 @@ def _fix_of_run(path: Path) -> str:
     return f"`{use}` {'shows' if is_done else 'resumes'} the run; else {sequence}."
 
 
-def _prepare(path: Path, *options: str | Path) -> str:
-    """The command that does every step, or those that make a sequence folder beside `path` and check it."""
-    data = _beside(path, "data")
-    every_step = command("run", path, _beside(path, "out"), *options)
-    return f"`{command('prepare', path, data, *options)}`, then `{command('check', data)}`; every step: `{every_step}`"
-
-
-def _beside(path: Path, ending: str) -> Path:
-    """A folder beside `path`, named after it: `clip_data` for `clip.mp4`."""
-    whole = path if path.name not in ("", "..") else Path(os.path.abspath(path))
-    return whole.with_name(f"{whole.stem if whole.is_file() else whole.name}_{ending}")
-
-
 def _pair(paths: Sequence[Path]) -> tuple[Path, Path] | None:
     """(left, right) if there are two paths whose names differ in that word only."""
     sides = {words[0][0].lower(): path for path in paths if len(words := SIDE.findall(path.stem)) == 1}
     if len(paths) != 2 or set(sides) != {"l", "r"} or len({SIDE.sub("", path.stem) for path in paths}) != 1:
         return None
     return sides["l"], sides["r"]
-
-
-def _has_images(folder: Path) -> bool:
-    """Whether a folder has two images or more."""
-    try:
-        return sum(entry.suffix.lower() in STILL_SUFFIXES and entry.name[0] != "." for entry in folder.iterdir()) > 1
-    except OSError:  # not readable
-        return False

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from .files import read_json, read_matrix
+from .files import named_file, read_json, read_matrix
 from .formats import Format
 from .images import read_color
 from .lens import COEFFICIENTS, Lens
@@ -84,9 +84,10 @@ def _posed(
     """One image; `lenses` keeps the same object for the same numbers."""
 
     def below(name: str) -> Path:
-        if not (path / name).is_relative_to(path):
+        found = named_file(path, name)
+        if PureWindowsPath(name).drive or not found.is_relative_to(path):
             raise input_error(file, "paths from its folder", name[:80], "write paths relative to the file.")
-        return path / name
+        return found
 
     image = below(_name(file, frame, index))
     if not image.suffix:  # as in Blender's data

@@ -17,13 +17,25 @@ FEWEST = 8  # ... and occurs in at least so many pixels, which measured depth at
 FARTHEST = 20.0  # depth beyond so many times the median of an image is an error of measurement
 CLIP_PERCENTILES = (3.0, 99.8)  # measured depths of a frame are clipped to these percentiles of themselves
 LEAST_PIXELS = 100  # the median of fewer says nothing
+STEPS_APART = 4.0  # a flat patch is filled if its edge is so many times as high as the usual step between two pixels
+USUAL_STEPS = 90  # percentile of the steps that are not 0: edges of tools are among them, and are no usual ones
+
+
+def is_matte(alpha: NDArray) -> bool:
+    """Whether an alpha channel makes a part of its image transparent. One that is the same everywhere shows all of it.
+
+    Args:
+        alpha: of any shape and type; empty if there is none.
+    """
+    return bool(alpha.size and alpha.min() < alpha.max())
 
 
 def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]:
     """(H, W) True where a depth file holds a measurement.
 
-    Missing is what is not finite, 0 or less; the largest number of a type of 16 bits or more; a number that occurs
-    often and far above all others, such as 10000 or 1e6; and single numbers far above the median.
+    Missing is what is not finite, 0 or less; the largest number of a type of 16 bits or more; a largest number that
+    occurs often and is far above all others, such as 10000 or 1e6, or that fills flat patches behind an edge
+    (`_is_filling`); and single numbers far above the median.
 
     Args:
         stored: (H, W) numbers of any type, in any unit.
@@ -37,13 +49,34 @@ def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]
         values = stored[measured]
         largest = values.max()
         is_largest = values == largest
-        if FEWEST <= is_largest.sum() < values.size and largest > GAP * float(values[~is_largest].max()):
+        is_far = FEWEST <= is_largest.sum() < values.size and largest > GAP * float(values[~is_largest].max())
+        if is_far or (not relative and _is_filling(stored, measured, largest)):
             measured &= stored != largest
             continue
         if values.size < LEAST_PIXELS or largest <= FARTHEST * float(values.min()):  # then none is beyond
             break
         return measured & (stored <= FARTHEST * float(np.median(values)))
     return measured
+
+
+def _is_filling(stored: NDArray, measured: NDArray[np.bool_], number: float) -> bool:
+    """Whether the largest number fills holes: in flat patches, whose edges are far higher than the steps of the rest.
+
+    A sensor writes the end of its range, such as 255, 4095 or 65534, where it measured nothing. Measured depth that was
+    clipped has no such edge around the number that it was clipped to.
+    """
+    filled = measured & (stored == number)
+    has_patch = cv2.erode(filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0).any()
+    rest = measured & ~filled
+    if not has_patch or not LEAST_PIXELS <= rest.sum() > filled.sum():
+        return False
+    values, steps, edges = np.where(measured, stored, 0).astype(np.float64), [], []
+    for now, before in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        apart = np.abs(values[now] - values[before])
+        steps.append(apart[rest[now] & rest[before] & (apart > 0)])
+        edges.append(apart[(filled[now] & rest[before]) | (rest[now] & filled[before])])
+    usual, edge = np.concatenate(steps), np.concatenate(edges)
+    return bool(usual.size and edge.size and np.median(edge) > STEPS_APART * np.percentile(usual, USUAL_STEPS))
 
 
 def clean_depth(

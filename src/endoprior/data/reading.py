@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 
 MOST_BYTES = 1 << 30  # largest size of one file, also after decompression
-MOST_PIXELS = 64_000_000  # of one image; 7680x4320 has half as many. `endoprior/__init__.py` tells OpenCV the same
+MOST_PIXELS = 64_000_000  # of one image; 7680x4320 has half as many. `system/surroundings.py` tells OpenCV the same
 MOST_TEXT_BYTES = 64 << 20  # largest size of a JSON, YAML or text file
 MOST_ARRAYS = 1000  # in one .npz file
 MOST_NODES = 100_000  # entries of a YAML text, each alias counted as often as it is used

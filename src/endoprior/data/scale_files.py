@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..system.atomic import whole_file, whole_folder, write_json
 from .description import PATH_RECORD, SCALE_PENDING, read_description
-from .files import read_json
+from .files import read_json, read_parts
 from .scale import Scale, demand_relative, described_scale
 from .writer import POSES, demand_writable
 
-LENGTHS_OF_PATH = ("translation_std_mm",)  # lists of lengths in `camera_path.json`
+LENGTHS_OF_PATH = {"translation_std_mm"}  # lists of lengths in `camera_path.json`
 TRACKS = Path("truth", "tracks.npz")  # known points, which `prepare --stir` lifts by the depth
 
 
@@ -48,7 +49,7 @@ def write_scale(folder: Path, scale: Scale) -> None:
             with whole_file(pending / POSES) as temporary, temporary.open("wb") as file:
                 np.save(file, scaled_poses(_read_table(folder / POSES), ratio))
         if (folder / PATH_RECORD).exists():
-            write_json(pending / PATH_RECORD, scaled_record(read_json(folder / PATH_RECORD), ratio))
+            write_json(pending / PATH_RECORD, scaled_record(_read_path(folder / PATH_RECORD), ratio))
         if (folder / TRACKS).exists():
             _scale_tracks(folder / TRACKS, pending / TRACKS.name, ratio)
         write_json(pending / "sequence.json", new)
@@ -77,10 +78,10 @@ def scaled_poses(table: NDArray[np.float64], ratio: float) -> NDArray[np.float64
 def scaled_record(record: dict[str, Any], ratio: float) -> dict[str, Any]:
     """The content of `camera_path.json` with its lengths multiplied."""
 
-    def times(values: list[float | None]) -> list[float | None]:
+    def times(values: Sequence[float | None]) -> list[float | None]:
         return [None if value is None else round(value * ratio, 5) for value in values]
 
-    return record | {name: times(record[name]) for name in LENGTHS_OF_PATH if isinstance(record.get(name), list)}
+    return record | {name: times(record[name]) for name in LENGTHS_OF_PATH if name in record}
 
 
 def _read_table(file: Path) -> NDArray[np.float64]:
@@ -88,6 +89,12 @@ def _read_table(file: Path) -> NDArray[np.float64]:
     if table.ndim != 2 or table.shape[1] != 17:
         raise input_error(file, "rows of 17 numbers", f"shape {table.shape}", "`endoprior poses DATA`.")
     return table
+
+
+def _read_path(file: Path) -> dict[str, Any]:
+    stored, fix = read_json(file), "remove it, or find the path again: `endoprior poses DATA`."
+    lengths = {name: tuple[float | int | None, ...] for name in LENGTHS_OF_PATH & stored.keys()}
+    return read_parts(file, lengths, fix)
 
 
 def _scale_tracks(file: Path, target: Path, ratio: float) -> None:

@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, overload
 
@@ -91,6 +91,8 @@ class FrameSequence:
     trained on nor scored. None: all alike (`data.reliability ignored`)."""
     reading: DataConfig | None = None
     """How `load_sequence` read it; None for a sequence that was made in another way."""
+    read_again: Callable[[DataConfig], FrameSequence] | None = None
+    """Reads the whole sequence in another way; None for a part or a changed one, which would be lost."""
     looks: Looks | None = None
     """What `window_plan.look_through` found; None before."""
 
@@ -126,6 +128,25 @@ class FrameSequence:
 
     def __len__(self) -> int:
         return len(self._cameras)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> FrameList: ...
+    def __getitem__(self, index: int | slice) -> Frame | FrameList:
+        """Frame `index` (negative: from the end), or the list of a slice of frames, decoded when they are used."""
+        return self.frames("video")[index]
+
+    def __iter__(self) -> Iterator[Frame]:
+        """All frames in order, decoded one by one."""
+        return iter(self.frames("video"))
+
+    def __repr__(self) -> str:
+        size = f"{self.camera(0).width}x{self.camera(0).height}" if len(self) else "no frames"
+        rate = f", {self.frames_per_second:g} frames per second" if self.frames_per_second else ""
+        split = ", ".join(f"{len(self.indices(split))} {split}" for split in ("train", "test"))
+        depth = "relative" if self.depth_is_relative else "mm"
+        return f"FrameSequence({str(self.path)!r}: {len(self)} frames ({split}), {size}{rate}, depth in {depth})"
 
     def camera(self, index: int) -> Camera:
         """The camera of frame `index`."""
@@ -173,6 +194,19 @@ class FrameSequence:
     def _counts(self, index: int) -> bool:
         return self.frame_weights is None or self.frame_weights[index] > 0
 
+    def read_as(self, cfg: DataConfig) -> FrameSequence:
+        """The sequence as `cfg` has it, read again for that if need be; layout and eyes are those that were found.
+
+        Itself where that would undo what somebody asked for: a part, other masks, or a reading that is not the default.
+        """
+        if self.reading is None or self.read_again is None:
+            return self
+        wanted, usual = replace(cfg, format=self.reading.format, eyes=self.reading.eyes), DataConfig()
+        names = [each.name for each in fields(usual) if getattr(wanted, each.name) != getattr(self.reading, each.name)]
+        if not names or any(getattr(self.reading, name) != getattr(usual, name) for name in names):
+            return self
+        return self.read_again(wanted)
+
     def all_alike(self) -> FrameSequence:
         """This sequence with every frame and pixel believed alike, as `data.reliability ignored` has it."""
         return self._with(frame_weights=None, _read_frame=self._read_frame)
@@ -203,6 +237,11 @@ class FrameSequence:
             expected = f"a phase that leaves a test frame of {len(self)} frames"
             raise input_error("data.test_phase", expected, str(phase), "choose a lower one; 0 is the published split.")
         return view
+
+    @property
+    def is_training_view(self) -> bool:
+        """Whether reading a test frame is an error."""
+        return self._holds_out
 
     def training_view(self) -> FrameSequence:
         """What a method trains on: no ground truth and no right eye, and reading a test frame is an error."""
@@ -259,7 +298,7 @@ class FrameSequence:
     def _with(self, **changes: Any) -> FrameSequence:
         """A view of this sequence with other attributes; frames that are read in another way are cached anew."""
         view = copy(self)
-        vars(view).update({"looks": None} | changes)
+        vars(view).update({"looks": None, "read_again": None} | changes)
         if "_read_frame" in changes:
             view._cache = BoundedCache(cache_bytes(), _frame_bytes)
         return view

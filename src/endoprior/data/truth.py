@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..core.geometry import FARTHEST_MM
+from ..core.strain import Strain
 from .description import LEAST, MOST, is_number
 from .files import IMAGE_SUFFIXES, files_with, read_json
 from .frame_files import match_names
@@ -33,6 +34,14 @@ class Tracks:
     paired: bool = True  # False if points of both ends are not matched, as in STIR: each is visible once
     region: NDArray[np.str_] | None = None
     """(P,) part of the tissue each point lies in, such as `pulled` or `smooth`; None if unknown."""
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """How the tissue at the points of the tracks is deformed since the first frame; axes of the first camera."""
+
+    displacement: NDArray[np.float32]  # (T, P, 3) mm
+    strain: Strain  # (T, P)
 
 
 class Truth:
@@ -133,6 +142,25 @@ class Truth:
         if region is not None and region.shape != visible.shape[1:]:
             raise input_error(path, f"a region of shape {visible.shape[1:]}", f"{region.shape}", _AGAIN)
         return Tracks(points, visible, bool(stored.get("paired", True)), region)
+
+    @cached_property
+    def deformation(self) -> Deformation | None:
+        """How the tissue of the tracks is deformed, or None."""
+        path, stored, tracks = self.folder / "mechanics.npz", self._array("mechanics.npz"), self.tracks
+        if stored is None:
+            return None
+        if tracks is None:
+            raise input_error(path, "tracks.npz beside it, with its points", "none", _AGAIN)
+        sizes = {"displacement": 3, "stretch": 2, "direction": 3}
+        found = stored if isinstance(stored, dict) else {}
+        for name, size in sizes.items():
+            shape = (*tracks.visible.shape, size)
+            array = found.get(name, np.zeros(0))
+            if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
+                got = f"{array.shape} of {array.dtype}" if name in found else "no such array"
+                raise input_error(path, f"{name}: finite numbers of shape {shape}", got, _AGAIN)
+        strain = Strain(*(found[name].astype(np.float64) for name in ("stretch", "direction")))
+        return Deformation(found["displacement"].astype(np.float32), strain)
 
 
 @dataclass(frozen=True)

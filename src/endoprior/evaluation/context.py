@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,8 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..data import FrameList, FrameSequence, Split
+from ..data.files import of_type, read_own, read_parts
 from ..model.scene import RenderedScene, Scene
 from ..system.atomic import write_json
 from ..system.memory import BoundedCache, cache_bytes
@@ -162,10 +163,28 @@ class Evaluation:
         file = folder / f"metrics{suffix}.json"
         facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
         if self.verdict is not None:
-            facts["verdict"] = {"word": self.verdict.word, "reasons": list(self.verdict.reasons)}
+            facts["verdict"] = asdict(self.verdict)
         write_json(file, facts | ({"protocols": self.protocols} if self.protocols else {}) | self.provenance)
         write_json(folder / f"per_frame{suffix}.json", self.per_frame)
         return file
+
+
+SCORED_AGAIN = "remove it, and score again: `endoprior eval RUN`, or the same `run` or `bench` command."
+
+
+def read_scores(file: Path, fix: str = SCORED_AGAIN) -> dict[str, Any]:
+    """What `Evaluation.save` wrote to `metrics.json`, or the like of masks."""
+    stored = read_parts(file, {"scores": dict[str, float]}, fix)
+    others = {"skipped": dict[str, str], "protocol": dict[str, Any]}
+    return stored | {name: of_type(file, hint, stored.get(name, {}), name, fix) for name, hint in others.items()}
+
+
+def read_frame_scores(file: Path, fix: str = SCORED_AGAIN) -> tuple[dict[str, float], ...]:
+    """What it wrote to `per_frame.json`: `index`, `time` and scores of each frame."""
+    rows = read_own(file, tuple[dict[str, float], ...], fix)
+    if not all(row.get("index", 0.5) % 1 == 0 for row in rows):
+        raise input_error(file, "an index in each row", "none", fix)
+    return rows
 
 
 @dataclass(frozen=True)
@@ -185,6 +204,8 @@ class EvaluationContext:
     """(T, 4, 4) camera-to-world, mm: stands in for the true path where there is none."""
     speed: bool = True
     """Whether to time the rendering, which takes a second or more."""
+    download: bool = False
+    """Whether weights that are not on this machine may be downloaded."""
 
     @cached_property
     def true_path(self) -> NDArray[np.float64] | None:

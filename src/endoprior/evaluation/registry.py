@@ -23,6 +23,8 @@ SCORERS = (
     "other_views",
     "highlights",
     "tracks",
+    "deformation",
+    "ranges",
     "camera_path",
     "references",
     "model",

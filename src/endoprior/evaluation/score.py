@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, cast, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -76,23 +76,3 @@ class Score:
     def text(self, value: float, relative: bool = False) -> str:
         """A value with its unit: `31.27 dB`."""
         return f"{value:,.{self.digits}f} {self.shown_unit(relative)}".rstrip()
-
-
-def scores_from(table: str) -> tuple[Score, ...]:
-    """Scores from a table of two lines each: its columns, and the description.
-
-    The columns are `name | label | unit | higher, lower or - | digits | absolute or relative | group | hint`. The unit
-    `true mm` is mm of the ground truth. A score whose hint is `-` is not printed in summaries; `- NAME` prints it where
-    the score NAME has no value.
-    """
-    lines = [line.strip() for line in table.strip().splitlines()]
-    scores = []
-    for columns, description in zip(lines[::2], lines[1::2], strict=True):
-        name, label, unit, better, digits, compare, group, hint = (column.strip() for column in columns.split("|"))
-        assert compare in ("absolute", "relative") and group in GROUPS, columns
-        is_printed, is_true = not hint.startswith("-"), unit.startswith("true ")
-        higher, unit = {"higher": True, "lower": False, "-": None}[better], unit.removeprefix("true ")
-        hint, instead = (hint, "") if is_printed else ("", hint.removeprefix("-").strip())
-        about = (cast(Any, compare), cast(Group, group), hint, is_printed, instead, is_true)
-        scores.append(Score(name, label, unit, higher, int(digits), description, *about))
-    return tuple(scores)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..compute.parallel_kernels import demand_unforked
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..data import FrameSequence, Split
@@ -33,6 +34,7 @@ def evaluate(
     *,
     networks: bool = True,
     speed: bool = True,
+    download: bool = False,
     weights_dir: Path | None = None,
     reading: DataConfig | None = None,
     given_path: NDArray[np.float64] | None = None,
@@ -44,17 +46,31 @@ def evaluate(
         scene: a trained scene, or anything that renders the frames of the sequence (`Reconstruction`). Scores that
             need a scene, or its Gaussians, are skipped where there are none.
         networks: also compute the scores that need a network (RAFT, LPIPS). Their weights are looked for in
-            `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache, and are downloaded at last.
+            `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache.
+        download: get weights that are in none of these from `download.pytorch.org`. False: scores that need
+            them are skipped.
         speed: also measure how many frames are rendered a second.
-        reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default.
+        reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default. One that
+            was opened without a `DataConfig` is read so, with depth as it was measured.
         given_path: (T, 4, 4) camera-to-world, mm, with which the scene's cameras are compared where the sequence has no
             true path.
         protocols: also score as these papers did, into `Evaluation.protocols`.
     Raises:
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
+        RuntimeError: this process is a fork of one that has rendered or trained.
+
+    Example:
+        >>> import endoprior
+        >>> scene, sequence = endoprior.load_scene("RUN"), endoprior.load_sequence("DATA")
+        >>> result = endoprior.evaluate(scene, sequence, networks=False)
+        >>> result.protocol["frames"], 0 < result.scores["psnr"] < 99
+        ([1, 9], True)
     """
+    demand_unforked()
     rendering: dict[str, str] = {}
     if isinstance(scene, RenderedScene):
+        if reading is None:
+            sequence = sequence.read_as(scored_data(scene.config.data))
         if len(sequence) != len(scene.cameras):
             expected = f"the {len(scene.cameras)} frames the scene was trained on"
             raise input_error(sequence.path, expected, str(len(sequence)), "pass the same sequence.")
@@ -70,7 +86,9 @@ def evaluate(
     result = Evaluation(_protocol(sequence, split, reading) | rendering)
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
-    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result, given_path, speed)
+    context = EvaluationContext(
+        frames, sequence, split, networks, weights_dir, result, given_path, speed, download=networks and download
+    )
     for name, scorer in scorers().items():
         with context.skip_if_unavailable(*(score.name for score in scorer.SCORES)):
             try:
@@ -104,6 +122,8 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "depth": "sum of weight * z against measured depth on tissue, mean of per-frame RMSE; " + unit,
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "track_*": "all frames of the video; *_dis: optical flow chained over them, held-out frames included",
+        "deformation_*": "all frames of the video since the first; *_dis: chained flow, held-out frames included",
+        "range_held_*": "all frames of the video; points picked on the surface in the first frame that shows them",
         "ate_mm": "all frames of the video; aligned by a rigid motion, or a similarity where depth is relative",
         "right_*": "tissue that both eyes see by measured depth; right pictures as they are, left mask",
         "poses": "of the scene",

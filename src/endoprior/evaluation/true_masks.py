@@ -27,16 +27,18 @@ from ..data.mask_files import MASK_SUFFIXES, demand_known, read_user_mask, rule_
 from ..data.reading import kind_of
 from ..footage.border import find_outline
 from ..footage.components import Image, Mask, components, distance_inside, grown
-from ..footage.overlays import LEAST_PX, find_static_overlays
+from ..footage.text_network import TextDetector
+from ..footage.texts import resting_rectangles
 from ..system.atomic import write_json
 from .context import Evaluation
 from .pictures import fingerprint, frames_of_files
-from .score import scores_from
+from .score import Score
 
 TOLERANCE = 0.0075  # Distance up to which outlines agree, as a share of the image diagonal (Csurka et al., BMVC 2013)
 TIP = 0.9  # A tip begins at this share of the tool's length
 LEAST_TEXT = 0.3
 """A masked region is the panel of a label, not a tool, if text or painted boxes are at least this share of it."""
+LEAST_PX = 7  # Smallest side of a painted rectangle, px
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """Rows and columns to half of a pixel's eight neighbors; the other half are the same steps back."""
@@ -44,20 +46,38 @@ SCORES_FILE = "mask_scores.json"
 SAMPLES = 20  # Largest number of frames in which the border and the polarity of the true masks are looked for
 MORE_ALIKE = 0.8
 """An image is of another frame if it differs from that one by less than this share of its difference from its own."""
-SCORES = scores_from("""
-    mask_iou | IoU | | higher | 4 | relative | masks | 1 is identical
-        Pixels that both masks mark, over those that either marks.
-    missed_area | missed area | | lower | 4 | relative | masks | tool that becomes tissue
-        True tool pixels that are not marked, over the true tool pixels.
-    false_area | false area | | lower | 4 | relative | masks | tissue lost around tools
-        Marked pixels that are no tool, over the true tool pixels, in frames that show a tool.
-    false_share_of_view | false, no tool | | lower | 4 | relative | masks | share of frames without a tool
-        Marked pixels over the pixels that count, in frames that show no tool.
-    boundary_f1 | boundary F1 | | higher | 4 | relative | masks | 1: outlines agree
-        Outline pixels within 0.75 % of the image diagonal of the other outline: F1 of precision and recall.
-    missed_tips | missed tips | | lower | 4 | relative | masks | the end that touches tissue
-        True pixels of the last 10 % of each tool's length that are not marked, over all such pixels.
-""")
+SCORES = (
+    Score(
+        "mask_iou", "IoU", "", True, 4,
+        "Pixels that both masks mark, over those that either marks.",
+        group="masks", hint="1 is identical",
+    ),
+    Score(
+        "missed_area", "missed area", "", False, 4,
+        "True tool pixels that are not marked, over the true tool pixels.",
+        group="masks", hint="tool that becomes tissue",
+    ),
+    Score(
+        "false_area", "false area", "", False, 4,
+        "Marked pixels that are no tool, over the true tool pixels, in frames that show a tool.",
+        group="masks", hint="tissue lost around tools",
+    ),
+    Score(
+        "false_share_of_view", "false, no tool", "", False, 4,
+        "Marked pixels over the pixels that count, in frames that show no tool.",
+        group="masks", hint="share of frames without a tool",
+    ),
+    Score(
+        "boundary_f1", "boundary F1", "", True, 4,
+        "Outline pixels within 0.75 % of the image diagonal of the other outline: F1 of precision and recall.",
+        group="masks", hint="1: outlines agree",
+    ),
+    Score(
+        "missed_tips", "missed tips", "", False, 4,
+        "True pixels of the last 10 % of each tool's length that are not marked, over all such pixels.",
+        group="masks", hint="the end that touches tissue",
+    ),
+)  # fmt: skip
 NO_VALUE = {
     "mask_iou": "neither mask marks a tool",
     "missed_area": "no scored frame shows a tool",
@@ -239,7 +259,7 @@ def counted_pixels(images: Sequence[Image], always_masked: Mask) -> Mask:
     - the masks, or the true masks, mark it in every frame. One of them is enough: prepared masks hold the border, and
       most true masks do not;
     - the images show nothing of the body there. It lies in a strip at a side or outside of a round border
-      (`footage.border.find_outline`), or on a label with its panel, which is burned-in text (`footage.overlays`) or
+      (`footage.border.find_outline`), or on a label with its panel, which is burned-in text (`footage.texts`) or
       a rectangle that `prepare --blank` painted, or it is exactly black in all images.
 
     So a tool that is static in the whole clip counts. A dark shaft does, too: a camera's black has noise. Pixels
@@ -252,12 +272,12 @@ def counted_pixels(images: Sequence[Image], always_masked: Mask) -> Mask:
     outline = find_outline(images)
     black = ~np.maximum.reduce(images).any(-1)
     border = outline.in_strip | outline.outside | black
-    return ~near(always_masked & (border | _labels(images, black, always_masked)))
+    return ~near(always_masked & (border | _labels(images, black, border, always_masked)))
 
 
-def _labels(images: Sequence[Image], black: Mask, always_masked: Mask) -> Mask:
+def _labels(images: Sequence[Image], black: Mask, border: Mask, always_masked: Mask) -> Mask:
     """(H, W) True on burned-in text, on painted rectangles, and on always masked regions that they cover largely."""
-    boxes = find_static_overlays(images)
+    boxes = resting_rectangles(images, TextDetector().find) if (always_masked & ~border).any() else []
     for x, y, width, height, area in components(black, 4)[1][1:].tolist():
         if area == width * height and min(width, height) >= LEAST_PX:  # a dark tool has another shape
             boxes.append((x, y, width, height))

@@ -14,6 +14,12 @@ Word = Literal["good", "usable", "doubtful", "wrong"]
 WORDS: tuple[Word, ...] = get_args(Word)
 """From best to worst."""
 GOOD, USABLE, DOUBTFUL, WRONG = range(len(WORDS))
+TO_LOOK_AT = (
+    "good to look at", "good enough to look at", "look at it only beside the video", "wrong: do not use it",
+)  # fmt: skip
+"""What the images of a model are good for, by how good they are."""
+TO_MEASURE = ("it can be measured", "measure with care", "do not measure")
+NO_MILLIMETERS = "do not measure: lengths are not millimeters"
 OVER_FLOW_DB, TISSUE_DB = (-3.0, -6.0), (33.0, 28.0)
 """Held-out frames are good, or usable, if their PSNR is near that of the nearest training frame moved by flow, or high.
 The moved frame is hard to beat: it has all texture, and the flow has seen the held-out frame."""
@@ -42,6 +48,8 @@ class Facts:
     share_used: float = 1.0
     """Share of the frames of the chosen part that were trained on or scored, 0..1."""
     share_with_missed_tools: float = 0.0
+    lengths_are_relative: bool = False
+    """Their unit is unknown: they are not mm."""
     depth_is_guessed: bool = False
     """Depth is guessed from one eye."""
     depth_measured: float | None = None
@@ -58,6 +66,8 @@ class Verdict:
 
     word: Word
     reasons: tuple[str, ...]
+    plain: str = ""
+    """What the model is good for, for one who does not read figures: to look at, and to measure."""
 
     def __str__(self) -> str:
         return f"{self.word}: {'; '.join(self.reasons)}"
@@ -65,14 +75,23 @@ class Verdict:
 
 def verdict_on(scores: Mapping[str, float], facts: Facts) -> Verdict:
     """The verdict on a model. Args: scores: of held-out frames, by name (docs/scores.md)."""
-    found = [*_images(scores), *_motion(scores, facts), *_depth(scores, facts), *_frames(facts)]
+    seen = [*_images(scores), *_frames(facts)]
+    motion = [*_motion(scores, facts)]
+    found = [*seen, *motion, *_depth(scores, facts)]
     found += [(DOUBTFUL, reason) for code, reason in CONTRADICTED.items() if code in facts.findings]
     worst = max((level for level, _ in found), default=DOUBTFUL)
     reasons = [reason for level, reason in found if level == worst]
-    if worst in (USABLE, GOOD):
-        return Verdict(WORDS[worst], tuple(reasons))
-    also = [reason for level, reason in found if USABLE <= level < worst]
-    return Verdict(WORDS[worst], (*reasons, *also))
+    also = [reason for level, reason in found if USABLE <= level < worst] if worst > USABLE else []
+    looks, moves = (max((level for level, _ in part), default=GOOD) for part in (seen, motion))
+    return Verdict(WORDS[worst], (*reasons, *also), _plain(looks, moves, worst, facts.lengths_are_relative))
+
+
+def _plain(looks: int, moves: int, worst: int, relative: bool) -> str:
+    """What a model is good for. Args: looks, moves: how good its images and its motion are; worst: all of it."""
+    if worst == WRONG:
+        return TO_LOOK_AT[WRONG].capitalize()
+    slides = ", but its tissue may not move as the real one does" if moves == DOUBTFUL > looks else ""
+    return f"{TO_LOOK_AT[looks]}{slides}; {NO_MILLIMETERS if relative else TO_MEASURE[worst]}".capitalize()
 
 
 def _graded(value: float, limits: Sequence[float]) -> int:

@@ -12,7 +12,7 @@ from ..system.atomic import whole_file, whole_folder, write_json
 from .formats import REGISTRY, ExportOptions, Files, Format, Progress, formats_of, load_format, usable_formats
 
 if TYPE_CHECKING:
-    from ..model.scene import Scene
+    from ..model.scene import RenderedScene, Scene
 
 
 def format_name(out: Path, options: ExportOptions) -> str:
@@ -25,17 +25,34 @@ def format_name(out: Path, options: ExportOptions) -> str:
     raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
 
 
-def export(scene: Scene, out: Path, options: ExportOptions, progress: Progress = lambda *_: None) -> list[Path]:
+def export(
+    scene: RenderedScene,
+    out: str | Path,
+    options: ExportOptions | None = None,
+    progress: Progress = lambda *_: None,
+) -> list[Path]:
     """Write `scene` in the format that `options` names, whole or not at all.
 
     Args:
+        scene: from `train` or `load_scene`.
         out: a file if its suffix is the format's, else a new or empty folder.
+        options: None: all as they are, and the format by the suffix of `out`.
     Returns:
         What was written: one file, or one folder.
     Raises:
         InputError: no format is named, neither by the options nor by `out`; an option has no meaning for the format;
-            `out` does not suit it; or there is nothing to write.
+            `out` does not suit it; there is nothing to write; or the scene is a radiance field.
+
+    Example:
+        >>> import endoprior
+        >>> from endoprior.export import ExportOptions
+        >>> files = endoprior.export(endoprior.load_scene("RUN"), "tissue.ply", ExportOptions(times=(0.5,)))
+        >>> [file.name for file in files]
+        ['tissue.ply']
     """
+    from ..model.scene import with_gaussians  # which takes long to import
+
+    scene, out, options = with_gaussians(scene), Path(out), options or ExportOptions()
     name = format_name(out, options)
     chosen = load_format(name)
     for field in fields(options):

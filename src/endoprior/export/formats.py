@@ -15,6 +15,7 @@ from ..core.checks import check_range
 from ..system.plugins import Registry
 
 if TYPE_CHECKING:
+    from ..core.types import Splats
     from ..model.scene import Scene
 
 Axes = Literal["opencv", "opengl", "ras", "lps"]
@@ -33,8 +34,11 @@ FORMATS = {
     "points": "ply:POINTS",
     "mesh": "mesh:FORMAT",
     "animation": "gltf:ANIMATION",
+    "usd": "usd:FORMAT",
     "slicer": "slicer:FORMAT",
     "cameras": "frames:CAMERAS",
+    "tum": "frames:TUM",
+    "kitti": "frames:KITTI",
     "depth": "frames:DEPTH",
     "tracks": "tracks:FORMAT",
     "measures": "measures:FORMAT",
@@ -67,6 +71,8 @@ class Format:
     """What is in a file, in plain words: `a mesh`; `endoprior export` says it of what it wrote."""
     has_index: bool = True
     """Whether a folder of its files also holds `index.json`; False where each file says itself what it is."""
+    read: Callable[[bytes], Splats] | None = None
+    """The Gaussians in a file of one time step, in the axes of the file: `endoprior export` says what was lost."""
     note: Callable[[Scene, Path, ExportOptions], str] | None = None
     """What a user of the file must know, in one line; `endoprior export` says it."""
     index_facts: Mapping[str, Any] | None = None

@@ -9,18 +9,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from ..core.shell import command
 from ..core.types import Camera
 from ..data.images import encode_png
 from ..model.scene import Scene
 from ..model.surface import render_surface
-from ..system.atomic import whole_folder, write_json
+from ..system.atomic import whole_folder, write_json, write_text
 from ..visualization.image_tools import to_u8
 from ..visualization.video import write_video
 from .axes import points_in_axes
 from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format, Progress
 from .time_steps import TimeStep, frame_indices, selected_time_steps
 
+MM_PER_M = 1000.0
 PNG_STEPS_PER_MM = 100
 """Depth in a PNG is counted in 0.01 mm, so 65535 is 655.35 mm."""
 
@@ -60,6 +63,44 @@ def _entry(number: int, name: str, camera: Camera, axes: Axes) -> dict[str, Any]
     return about | pose | {name: getattr(camera, name) for name in ("fy", "fx", "cx", "cy")}
 
 
+def write_tum(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
+    """Write the path of the camera as the TUM RGB-D benchmark has it: `time x y z qx qy qz qw`, s and m."""
+    steps = selected_time_steps(scene, options)
+    seconds = [step.time * len(scene.cameras) / scene.frames_per_second for step in steps]
+    poses = _camera_to_world(scene, steps)
+    rows = np.column_stack([seconds, poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat()])
+    write_text(out, f"# time x y z qx qy qz qw: {_about(scene)}\n{_lines(rows)}")
+    progress(1, 1)
+
+
+def write_kitti(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
+    """Write the path of the camera as KITTI's odometry benchmark has it: the 3x4 pose row by row in each line, m."""
+    poses = _camera_to_world(scene, selected_time_steps(scene, options))
+    write_text(out, _lines(poses.reshape(-1, 12)))  # its readers take no comments
+    progress(1, 1)
+
+
+def path_note(scene: Scene, out: Path, _options: ExportOptions) -> str:
+    """What the numbers are, and the command that reads them."""
+    return f"{_about(scene)}. To read it: `{command('poses', 'DATA', '--poses', out)}`"
+
+
+def _about(scene: Scene) -> str:
+    unit = "1000 units of an assumed scale" if scene.lengths_are_relative else "m"
+    return f"camera to world, OpenCV axes, {unit}, of the frames after rectification"
+
+
+def _camera_to_world(scene: Scene, steps: list[TimeStep]) -> NDArray[np.float64]:
+    """(T, 3, 4) poses, m."""
+    poses = np.array([np.linalg.inv(step.camera(scene).world_to_camera)[:3] for step in steps], np.float64)
+    poses[:, :, 3] /= MM_PER_M
+    return poses
+
+
+def _lines(rows: NDArray[np.float64]) -> str:
+    return "".join(" ".join(f"{value:.9g}" for value in row) + "\n" for row in rows + 0.0)  # no -0
+
+
 def write_rendered(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
     """Write the frames of a split, rendered from their cameras, as H.264 mp4 at the sequence's frame rate."""
     indices = frame_indices(len(scene.cameras), options.split, scene.config.data)
@@ -93,5 +134,7 @@ DEPTH = Format(
     holds="depth",
 )
 CAMERAS = Format(suffixes=(".json",), options=TIME_STEP_OPTIONS, write=write_cameras, holds="cameras")
+TUM = Format((".tum",), ("times", "split"), write=write_tum, holds="the path of the camera", note=path_note)
+KITTI = Format((".kitti",), ("times", "split"), write=write_kitti, holds="the path of the camera", note=path_note)
 VIDEO = Format(suffixes=(".mp4",), options=("split",), write=write_rendered, holds="a video")
 SCENE = Format(suffixes=(".safetensors",), options=(), write=write_scene, holds="the whole scene, motion included")

@@ -25,7 +25,7 @@ from ..system.atomic import whole_file
 from .axes import points_in_axes
 from .formats import TIME_STEP_OPTIONS, ExportOptions, Format, Progress
 from .mesh import SURFACE_OPTIONS, surface_mesh
-from .ply import GAUSSIAN_OPTIONS, unit_quaternions
+from .ply import GAUSSIAN_OPTIONS, splats_of, unit_quaternions
 from .time_steps import TimeStep, seconds_of_motion, selected_time_steps
 
 SPLATTING = "KHR_gaussian_splatting"
@@ -130,6 +130,27 @@ def encode_glb(splats: Splats, extras: dict[str, Any]) -> bytes:
     return buffer.file(SPLATTING, {}, {"primitives": [primitive]}, extras)
 
 
+def decode_glb(data: bytes) -> Splats:
+    """The Gaussians of `encode_glb`."""
+    (size,) = struct.unpack_from("<I", data, 12)
+    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+    primitive = document["meshes"][0]["primitives"][0]
+
+    def values(name: str) -> NDArray[np.float32]:
+        accessor = document["accessors"][primitive["attributes"][name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        return np.frombuffer(body, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(accessor["count"], -1)
+
+    bands = [name for name in primitive["attributes"] if name.startswith(f"{SPLATTING}:SH_DEGREE_")]
+    return splats_of(
+        means=values("POSITION"),
+        quats=values(f"{SPLATTING}:ROTATION")[:, [3, 0, 1, 2]],
+        scales=values(f"{SPLATTING}:SCALE"),
+        opacities=values(f"{SPLATTING}:OPACITY")[:, 0],
+        sh=np.stack([values(name) for name in bands], 1),
+    )
+
+
 # The moving mesh. Carried by the Gaussians, each vertex is one material point. Morph target i displaces every vertex to
 # where it is at time step i + 1; the animation fades from each target to the next.
 
@@ -166,7 +187,8 @@ def write_animation(scene: Scene, out: Path, options: ExportOptions, progress: P
     content = buffer.file(
         UNLIT,
         {"name": "tissue"},
-        {"name": "tissue", "primitives": [primitive], "extras": names},
+        # VTK moves only a mesh that has weights; they are optional.
+        {"name": "tissue", "primitives": [primitive], "weights": [0.0] * len(targets), "extras": names},
         {"unit": length_unit(relative), "axes": options.axes, "lengths_are_relative": relative},
         materials=[{"name": "tissue", "doubleSided": True, "extensions": {UNLIT: {}}}],
         animations=[{"name": "motion", "samplers": [sampler], "channels": [channel]}],
@@ -186,7 +208,7 @@ def blender_note(scene: Scene, out: Path, options: ExportOptions) -> str:
     return f"a .glb file does not say which frames to play. In Blender's Python console, type: {code}"
 
 
-GAUSSIANS = Format((".glb",), GAUSSIAN_OPTIONS, gaussians, default_axes="opengl", holds="Gaussians")
+GAUSSIANS = Format((".glb",), GAUSSIAN_OPTIONS, gaussians, default_axes="opengl", holds="Gaussians", read=decode_glb)
 ANIMATION = Format(
     suffixes=(".glb",),
     options=(*TIME_STEP_OPTIONS, *SURFACE_OPTIONS),

@@ -37,9 +37,11 @@ from torch import Tensor
 from ..core.checks import InputError, input_error
 from ..core.geometry import length_unit
 from ..core.types import Camera, Splats
+from ..model.carry import TIED_ANEW_PX
 from ..model.photometric import GRID
 from ..model.playback import faded
 from ..model.scene import Scene, Shown
+from ..model.uncertainty import ACROSS, CELLS, DRIFT, START, UNKNOWN_NOISE, Across, Along, half_width
 from ..render.constants import ALPHA_MIN, NEAR_Z
 from ..render.projection import color_slopes
 from ..render.sh import colors
@@ -55,7 +57,8 @@ PACKING_BYTES = 40  # memory in which a thread packs a channel, bytes for each o
 DEFLATE_LEVEL = 6
 """zlib level: 9 saves 2 % and takes three times as long."""
 PLAYER = Path(__file__).parent / "player"
-SCRIPTS = ("aside.js", "unpack.js", "blocks.js", "sort.js", "camera.js", "shaders.js", "draw.js", "player.js")
+SCRIPTS = ("aside.js", "unpack.js", "blocks.js", "sort.js", "camera.js", "shaders.js", "draw.js")
+SCRIPTS += ("ranges.js", "measure.js", "window.js", "player.js")
 
 
 class PageTooLarge(InputError):
@@ -127,14 +130,15 @@ def write_html(
             raise _too_large(out, max_bytes, size * len(times) / stop, len(times), num_shown.max())
     if not blocks:
         raise InputError(NOTHING_VISIBLE)
+    unit = length_unit(scene.lengths_are_relative)
     about = _about(scene, times) | {
+        "unit": unit,
         "gaussians": int(num_shown.max()),
         "focus": np.interp(range(len(times)), list(focus), list(focus.values())).round(3).tolist(),
         "depth_range": [min(depths), max(depths)],
         "channels": CHANNELS,
         "blocks": blocks,
     }
-    unit = length_unit(scene.lengths_are_relative)
     page = _page(title or DEFAULT_TITLE, remark, unit, about, b"".join(streams)).encode()
     if len(page) > max_bytes:
         raise _too_large(out, max_bytes, len(page), len(times), num_shown.max())
@@ -165,6 +169,32 @@ def _about(scene: Scene, times: list[float]) -> dict[str, Any]:
         "cameras": rows,
         "background": list(scene.background),
         "seconds": [time * len(scene.cameras) / scene.frames_per_second for time in times],
+        "ranges": _ranges(scene, times),
+    }
+
+
+def _ranges(scene: Scene, times: list[float]) -> dict[str, Any]:
+    """What the page needs for ranges: the numbers of `uncertainty`, with the half width of 95 % in place of degrees of
+    freedom; the noise of depth at each time, as a share of it; and which cells show tissue, one bit each.
+    """
+
+    def row(of: Across | Along) -> list[float]:
+        *shares, freedom = of
+        return [*shares, half_width(freedom)]
+
+    shown = [scene.window_at(min(round(time * len(scene.cameras)), len(scene.cameras) - 1)) for time in times]
+    masks = [
+        np.ones(CELLS, bool) if window.tissue is None else window.tissue[own].numpy() >= 128 for window, own in shown
+    ]
+    bits = b"".join(np.packbits(mask).tobytes() for mask in masks)
+    return {
+        "across": [row(of) for of in ACROSS],
+        "drift": [row(of) for of in DRIFT],
+        "start": [START.depth, half_width(START.freedom)],
+        "noise": [window.depth_noise or UNKNOWN_NOISE for window, _ in shown],
+        "tied_anew": TIED_ANEW_PX**2,
+        "cells": CELLS,
+        "tissue": base64.b64encode(bits).decode(),
     }
 
 

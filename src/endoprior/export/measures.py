@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.geometry import length_unit, project
-from ..model.carry import carry, carry_points
-from ..model.measures import SurfaceMotion, distance, measures_of
+from ..model.carry import CarriedPoints, carry
+from ..model.measures import SurfaceMotion, distance, measures_of, unit_vectors
 from ..model.scene import Scene
 from ..model.surface import render_surface
+from ..model.uncertainty import point_errors
 from ..system.atomic import whole_folder
 from ..visualization.measures import displacement_span, measures_csv, stretch_span, value_colors, write_figure
 from .axes import points_in_axes
@@ -51,18 +52,31 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     motion = SurfaceMotion(scene, since, options.min_alpha)
     frames = list(range(min(since, until), max(since, until) + 1))
     at_since = np.zeros(len(mesh.vertices), np.intp)
-    moved = carry_points(scene, mesh.vertices, at_since, [times[since], *(times[frame] for frame in frames)])[1:]
+    carried = carry(scene, mesh.vertices, at_since, [times[since], *(times[frame] for frame in frames)])
+    moved, ends = carried.positions[1:], [0, 1 + frames.index(until)]
+    both = CarriedPoints(carried.positions[ends], carried.spread_px[ends])
+    strain = motion.strain(mesh.vertices.astype(np.float64), frames)
     values = {  # (T, V) each: straight distance, mm, and largest principal stretch, NaN where unknown
         "displacement": np.stack([distance(there, mesh.vertices) for there in moved]),
-        "stretch": motion.stretch(mesh.vertices.astype(np.float64), frames),
+        "stretch": strain.stretch[..., 0],
+    }
+    others = {
+        "stretch_smallest": strain.stretch[..., 1],
+        "area_change": strain.area,
+        "direction": points_in_axes(strain.direction, options.axes),
     }
     maps = {name: each[frames.index(until)] for name, each in values.items()}
     spans = displacement_span(maps["displacement"]), stretch_span(maps["stretch"])
+    way = unit_vectors(moved[ends[1] - 1] - mesh.vertices)
+    sure_to = point_errors(scene, both, at_since, [since, until]).half_width(np.stack([way, way]), since_pick=True)[1]
     with whole_folder(out) as folder:
         (folder / SURFACES).mkdir()
         about, files = f"axes {options.axes}, unit {unit}", []
         for k, frame in enumerate(frames):
-            place, now = points_in_axes(moved[k], options.axes), {name: each[k] for name, each in values.items()}
+            place, now = (
+                points_in_axes(moved[k], options.axes),
+                {name: each[k] for name, each in (values | others).items()},
+            )
             files.append(f"{SURFACES}/{frame:06d}.vtp")
             (folder / files[-1]).write_bytes(vtp_bytes(place, mesh.triangles, now, about))
             progress(k, len(frames))
@@ -70,16 +84,17 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         positions = points_in_axes(mesh.vertices, options.axes)
         # In the colors of one map, with the values of both.
         for (name, shown), span in zip(maps.items(), spans, strict=True):
-            columns = colored(positions, value_colors(shown, span)) | maps
+            columns = colored(positions, value_colors(shown, span)) | maps | {"displacement_range95": sure_to}
             (folder / f"{name}.ply").write_bytes(ply_bytes(columns, options.axes, unit, mesh.triangles))
         points, curves = np.zeros((0, 2)), None
         if options.points:
             queries = read_query_points(options.points, scene)
-            carried = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
-            paths = carried.positions
+            followed = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
+            paths = followed.positions
             around = motion.stretch(paths[since].astype(np.float64), list(range(num_frames)))
-            found = measures_of(paths, around, since, drawn=int(queries.frames[-1]))
-            table = measures_csv(found, rate, unit, carried.confidence)
+            errors = point_errors(scene, followed, queries.frames, range(num_frames))
+            found = measures_of(paths, around, since, int(queries.frames[-1]), errors)
+            table = measures_csv(found, rate, unit, errors.confidence)
             (folder / "measures.csv").write_text(table, encoding="utf-8", newline="\n")
             points, curves = project(paths[since].astype(np.float64), camera)[0], (found, rate, unit)
         on_image = project(mesh.vertices.astype(np.float64), camera)[0], mesh.triangles
@@ -108,7 +123,7 @@ def vtp_bytes(
 
     Args:
         vertices: (V, 3), in the axes of the file. triangles: (F, 3) vertex numbers.
-        values: (V,) each, by the name under which programs list them; the first is shown. NaN where unknown.
+        values: (V,) or (V, 3) each, by the name under which programs list them; the first is shown. NaN where unknown.
         about: a comment on axes and unit.
     """
     ends = 3 * np.arange(1, len(triangles) + 1, dtype="<i4")

@@ -2,7 +2,8 @@
 
 Sources: https://developer.playcanvas.com (compressed PLY; The SOG Format), https://github.com/nianticlabs/spz,
 https://github.com/antimatter15/splat. SuperSplat and splat-transform read all. Equal Gaussians give equal bytes. `N`
-Gaussians, `C` chunks. Encoders raise InputError for a position that is not finite.
+Gaussians, `C` chunks. Encoders raise InputError for a position that is not finite;
+decoders read what they write.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from zipfile import ZipFile, ZipInfo
 import numpy as np
 from numpy.typing import NDArray
 from PIL.Image import fromarray
+from PIL.Image import open as open_pixels
 
 from ..core.checks import input_error
 from ..core.geometry import length_unit
@@ -27,7 +29,7 @@ from ..model.gaussians import SH_C0
 from ..model.scene import Scene
 from ..render.sh import degree_of
 from .formats import Axes, ExportOptions, Format
-from .ply import GAUSSIAN_OPTIONS, unit_quaternions, when
+from .ply import GAUSSIAN_OPTIONS, ply_elements, splats_of, unit_quaternions, when
 from .time_steps import TimeStep
 
 # Compressed PLY: 16 bytes a Gaussian, and 18 floats for each chunk of 256 of them.
@@ -81,6 +83,34 @@ def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm
     return header.encode() + ranges.tobytes() + body
 
 
+def decode_compressed_ply(data: bytes) -> Splats:
+    """The Gaussians of `encode_compressed_ply`, in the order of the file."""
+    elements = ply_elements(data)
+    words = np.stack([elements["vertex"][name] for name in PACKED], 1).astype(np.int64)
+    ends = np.stack([elements["chunk"][name] for name in RANGES], 1).astype(np.float64)
+    ends = np.repeat(ends, CHUNK, axis=0)[: len(words)].reshape(-1, 3, 2, 3)  # of position, log scale and color
+
+    def within(shares: NDArray, which: int) -> NDArray[np.float64]:
+        low, high = ends[:, which, 0], ends[:, which, 1]
+        return low + shares * (high - low)
+
+    means, log_scales = (_unpacked(words[:, k], (21, 11, 0), (11, 10, 11)) for k in (0, 2))
+    others = _unpacked(words[:, 1], (20, 10, 0), (10, 10, 10))
+    colors = _unpacked(words[:, 3], (24, 16, 8, 0), (8, 8, 8, 8))
+    sh = [((within(colors[:, :3], 2) - 0.5) / SH_C0)[:, None]]
+    if "sh" in elements:
+        stored = elements["sh"]
+        rest = np.stack([stored[name] for name in stored.dtype.names or ()], 1) * (8 / 255) - 4
+        sh.append(rest.reshape(len(rest), 3, -1).transpose(0, 2, 1))
+    return splats_of(
+        means=within(means, 0),
+        quats=_from_smallest_three(words[:, 1] >> 30, others),
+        scales=np.exp(within(log_scales, 1)),
+        opacities=colors[:, 3],
+        sh=np.concatenate(sh, 1),
+    )
+
+
 def _within_chunks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Where (N, 3) values lie between the ends of their chunk, 0..1, and (C, 6) these, rounded outward to float32."""
     starts = np.arange(0, len(values), CHUNK)
@@ -96,6 +126,12 @@ def _within_chunks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
 def _packed(columns: NDArray[np.int64], shifts: tuple[int, ...]) -> NDArray[np.int64]:
     """(N,) columns of integers side by side in one, each shifted by so many bits."""
     return np.bitwise_or.reduce(columns << shifts, axis=1)
+
+
+def _unpacked(words: NDArray[np.int64], shifts: tuple[int, ...], bits: tuple[int, ...]) -> NDArray[np.float64]:
+    """(N, C) shares, 0..1, of what `_packed` put side by side."""
+    most = 2 ** np.array(bits) - 1
+    return (words[:, None] >> np.array(shifts) & most) / most
 
 
 # SOG version 2: a zip archive of images with one pixel per Gaussian, in the axes of a PLY file.
@@ -134,6 +170,29 @@ def encode_sog(splats: Splats) -> bytes:
         for name, values in images.items():
             archive.writestr(ZipInfo(f"{name}.webp"), _webp(values))
     return file.getvalue()
+
+
+def decode_sog(data: bytes) -> Splats:
+    """The Gaussians of `encode_sog`, in the order of the file."""
+    with ZipFile(io.BytesIO(data)) as archive:
+        about = json.loads(archive.read("meta.json"))
+
+        def pixels(name: str) -> NDArray[np.int64]:
+            with open_pixels(io.BytesIO(archive.read(f"{name}.webp"))) as image:
+                values = np.array(image)
+            return values.reshape(-1, values.shape[2])[: about["count"]].astype(np.int64)
+
+        steps = pixels("means_l") | pixels("means_u") << 8
+        scales, quats, colors = pixels("scales"), pixels("quats"), pixels("sh0")
+    low, high = (np.array(about["means"][end]) for end in ("mins", "maxs"))
+    logs = low + (high - low) * steps / 65535
+    return splats_of(
+        means=np.sign(logs) * np.expm1(np.abs(logs)),
+        quats=_from_smallest_three(quats[:, 3] - FIRST_ALPHA, quats[:, :3] / 255),
+        scales=np.exp(np.array(about["scales"]["codebook"])[scales]),
+        opacities=colors[:, 3] / 255,
+        sh=np.array(about["sh0"]["codebook"])[colors[:, None, :3]],
+    )
 
 
 def _by_codebook(values: NDArray[np.float64]) -> tuple[NDArray[np.int64], list[float]]:
@@ -182,6 +241,28 @@ def encode_spz(splats: Splats) -> bytes:
     return gzip.compress(header + b"".join(block.tobytes() for block in blocks), mtime=0)
 
 
+def decode_spz(data: bytes) -> Splats:
+    """The Gaussians of `encode_spz`."""
+    content = gzip.decompress(data)
+    _, _, count, degree, bits, _, _ = struct.unpack_from("<IIIBBBB", content)
+    widths = (9, 1, 3, 3, 3, 3 * ((degree + 1) ** 2 - 1))
+    values = np.frombuffer(content, np.uint8, offset=16)
+    blocks = np.split(values, np.cumsum([count * width for width in widths])[:-1])
+    means, opacities, colors, log_scales, turns, rest = (
+        block.reshape(count, width).astype(np.float64) for block, width in zip(blocks, widths, strict=True)
+    )
+    steps = means.reshape(count, 3, 3) @ [1, 2**8, 2**16]
+    xyz = turns / 127.5 - 1
+    w = np.sqrt((1 - (xyz**2).sum(1, keepdims=True)).clip(0))
+    return splats_of(
+        means=np.where(steps < 2**23, steps, steps - 2**24) / 2.0**bits,
+        quats=np.concatenate([w, xyz], 1),
+        scales=np.exp(log_scales / 16 - 10),
+        opacities=opacities[:, 0] / 255,
+        sh=np.concatenate([((colors / 255 - 0.5) / COLOR_SCALE)[:, None], rest.reshape(count, -1, 3) / 128 - 1], 1),
+    )
+
+
 def _well_conditioned(quats: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternions (w, x, y, z) of the same ellipsoids with w at least 1/2.
 
@@ -213,6 +294,19 @@ def encode_splat(splats: Splats) -> bytes:
     records["rgba"] = _bytes(np.column_stack([splats.sh.numpy()[:, 0] * SH_C0 + 0.5, opacities]) * 255)
     records["rotation"] = _bytes(unit_quaternions(splats.quats.numpy()) * 128 + 128)
     return records[order].tobytes()
+
+
+def decode_splat(data: bytes) -> Splats:
+    """The Gaussians of `encode_splat`, in the order of the file."""
+    records = np.frombuffer(data, RECORD)
+    colors = records["rgba"] / 255
+    return splats_of(
+        means=records["center"],
+        quats=records["rotation"] / 128 - 1,
+        scales=records["scale"],
+        opacities=colors[:, 3],
+        sh=((colors[:, :3] - 0.5) / SH_C0)[:, None],
+    )
 
 
 # What they share.
@@ -252,6 +346,15 @@ def _smallest_three(quats: NDArray[np.float64], bits: int) -> tuple[NDArray[np.i
     return largest, _in_bits(others / np.sqrt(2) + 0.5, bits)
 
 
+def _from_smallest_three(largest: NDArray[np.int64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4) unit quaternions of `_smallest_three`, whose integers are given as shares, 0..1."""
+    quats = np.zeros((len(largest), 4))
+    small = (others - 0.5) * np.sqrt(2)
+    quats[np.arange(4) != largest[:, None]] = small.ravel()
+    quats[np.arange(len(quats)), largest] = np.sqrt((1 - (small**2).sum(1)).clip(0))
+    return quats
+
+
 def _in_bits(shares: NDArray[np.float64], bits: int | tuple[int, ...]) -> NDArray[np.int64]:
     """The integers of so many bits for values in 0..1."""
     most = 2 ** np.array(bits) - 1
@@ -262,14 +365,24 @@ def _bytes(values: NDArray) -> NDArray[np.uint8]:
     return np.rint(values).clip(0, 255).astype(np.uint8)
 
 
-def _format(suffix: str, encode: Callable[[Splats], bytes], axes: Axes = "opencv") -> Format:
+def _format(
+    suffix: str, encode: Callable[[Splats], bytes], decode: Callable[[bytes], Splats], axes: Axes = "opencv"
+) -> Format:
     """A format of one file for each time step that says nothing of axes and time."""
 
     def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
         return {suffix: encode(step.plain_splats(scene, options.axes))}
 
-    return Format((suffix,), GAUSSIAN_OPTIONS, files, default_axes=axes, holds="Gaussians")
+    return Format((suffix,), GAUSSIAN_OPTIONS, files, default_axes=axes, holds="Gaussians", read=decode)
 
 
-SOG, SPZ, SPLAT = _format(".sog", encode_sog), _format(".spz", encode_spz, "opengl"), _format(".splat", encode_splat)
-COMPRESSED_PLY = Format((".ply",), GAUSSIAN_OPTIONS, compressed_ply, holds="compressed Gaussians", has_index=False)
+SOG, SPLAT = _format(".sog", encode_sog, decode_sog), _format(".splat", encode_splat, decode_splat)
+SPZ = _format(".spz", encode_spz, decode_spz, "opengl")
+COMPRESSED_PLY = Format(
+    (".ply",),
+    GAUSSIAN_OPTIONS,
+    compressed_ply,
+    holds="compressed Gaussians",
+    read=decode_compressed_ply,
+    has_index=False,
+)

@@ -54,6 +54,47 @@ def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment:
     return ply_bytes(columns, axes, unit, comment=comment)
 
 
+def decode_ply(data: bytes) -> Splats:
+    """The Gaussians of `encode_ply`."""
+    vertices = ply_elements(data)["vertex"]
+
+    def columns(*names: str) -> NDArray[np.float32]:
+        return np.stack([vertices[name] for name in names], 1)
+
+    rest = [name for name in vertices.dtype.names or () if name.startswith("f_rest_")]
+    higher = np.stack([vertices[name] for name in rest], 1) if rest else np.zeros((len(vertices), 0))
+    higher = higher.reshape(len(vertices), 3, len(rest) // 3).transpose(0, 2, 1)
+    return splats_of(
+        means=columns(*"xyz"),
+        quats=columns(*(f"rot_{i}" for i in range(4))),
+        scales=np.exp(columns(*(f"scale_{i}" for i in range(3)))),
+        opacities=1 / (1 + np.exp(-vertices["opacity"].astype(np.float64))),
+        sh=np.concatenate([columns(*(f"f_dc_{i}" for i in range(3)))[:, None], higher], 1),
+    )
+
+
+def splats_of(**values: NDArray) -> Splats:
+    """`Splats` of what a file holds, activated."""
+    return Splats(**{name: torch.from_numpy(np.array(value, np.float32, order="C")) for name, value in values.items()})
+
+
+def ply_elements(data: bytes) -> dict[str, NDArray]:
+    """The elements of a binary PLY file of ours without lists, each an array with the names of its properties."""
+    header, body = data.split(b"end_header\n", 1)
+    kinds = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for words in map(str.split, header.decode().splitlines()):
+        if words[0] == "element":
+            elements.append((words[1], int(words[2]), []))
+        elif words[0] == "property":
+            elements[-1][2].append((words[2], kinds[words[1]]))
+    found, at = {}, 0
+    for name, count, properties in elements:
+        found[name] = np.frombuffer(body, properties, count, at)
+        at += found[name].nbytes
+    return found
+
+
 def unit_quaternions(quats: NDArray) -> NDArray:
     """(N, 4) quaternions scaled to length 1."""
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
@@ -123,6 +164,7 @@ PLY = Format(
     options=GAUSSIAN_OPTIONS,
     files=gaussians,
     holds="Gaussians",
+    read=decode_ply,
     has_index=False,  # SuperSplat plays a folder as a sequence only if it holds nothing else
 )
 POINTS = Format((".ply",), (*GAUSSIAN_OPTIONS, "min_opacity"), points, holds="colored points")

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.geometry import length_unit
 from ..core.types import Camera
-from ..model.carry import CarriedPoints, carry
+from ..model.carry import carry
 from ..model.scene import Scene
+from ..model.uncertainty import LEVEL, PointErrors, point_errors
 from ..system.atomic import whole_file
 from .axes import points_in_axes
 from .formats import ExportOptions, Format, Progress
@@ -103,8 +104,9 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     surfaces = (encode_mesh(mesh, "ply", "lps", unit) for mesh in chain([first], meshes))
     files: list[tuple[Played, Iterable[bytes]]] = [(TISSUE, surfaces)]
     if options.points:
-        found = _carried(scene, options.points, options.min_alpha, steps)
-        files.append((POINTS, (markups(*there) for there in zip(found.positions, found.confidence, strict=True))))
+        positions, errors = _carried(scene, options.points, options.min_alpha, steps)
+        texts = zip(errors.confidence, errors.across.half_width(LEVEL), errors.along(), strict=True)
+        files.append((POINTS, (markups(*there, unit) for there in zip(positions, texts, strict=True))))
     with whole_file(out) as temporary, ZipFile(temporary, "w") as archive:
         start = _scene_text(first, steps[0].camera(scene), seconds, [played for played, _ in files])
         _put(archive, f"{FOLDER}.mrml", start)
@@ -112,21 +114,36 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             _put_sequence(archive, played, contents, seconds, progress)
 
 
-def _carried(scene: Scene, file: Path, min_alpha: float, steps: list[TimeStep]) -> CarriedPoints:
-    """The query points of a file at the time steps."""
+def _carried(
+    scene: Scene, file: Path, min_alpha: float, steps: list[TimeStep]
+) -> tuple[NDArray[np.float32], PointErrors]:
+    """(T, P, 3) positions, mm, and errors of the query points of a file at the time steps."""
     queries = read_query_points(file, scene)
     starts = back_projected(scene, queries, min_alpha)
     frames, own = np.unique(queries.frames, return_inverse=True)
     times = [*(frames / len(scene.cameras)), *(step.time for step in steps)]
-    found = carry(scene, starts, own, times)
-    return CarriedPoints(found.positions[len(frames) :], found.confidence[len(frames) :])
+    found, cameras = carry(scene, starts, own, times), scene.cameras
+    shown_by = [min(round(time * len(cameras)), len(cameras) - 1) for time in times]
+    later = slice(len(frames), None)
+    return found.positions[later], point_errors(scene, found, own, shown_by).at(later)
 
 
-def markups(positions: NDArray[np.float32], confidence: NDArray[np.float32]) -> bytes:
-    """A .mrk.json file of (P, 3) positions in world axes, mm, labeled by their number in `tracks`."""
+def markups(positions: NDArray[np.float32], errors: tuple[NDArray, NDArray, NDArray], unit: str) -> bytes:
+    """A .mrk.json file of (P, 3) positions in world axes, mm, labeled by their number in `tracks`.
+
+    Args:
+        errors: (P,) each: confidence, and half of the 95 % range across and along the ray of the camera, in `unit`.
+    """
     points = [
-        {"id": f"{k + 1}", "label": f"{k}", "description": f"confidence {share:.2f}", "position": place}
-        for k, (place, share) in enumerate(zip(points_in_axes(positions, "lps").tolist(), confidence, strict=True))
+        {
+            "id": f"{k + 1}",
+            "label": f"{k}",
+            "description": f"confidence {share:.2f}; ±{across:.2f} {unit} across, ±{along:.2f} {unit} along the view",
+            "position": place,
+        }
+        for k, (place, share, across, along) in enumerate(
+            zip(points_in_axes(positions, "lps").tolist(), *errors, strict=True)
+        )
     ]
     fiducials = {"type": "Fiducial", "coordinateSystem": "LPS", "locked": True, "controlPoints": points}
     return json.dumps({"@schema": MARKUPS_SCHEMA, "markups": [fiducials]}, allow_nan=False).encode()

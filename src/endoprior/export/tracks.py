@@ -17,11 +17,12 @@ from ..evaluation.scoring import scored_data
 from ..model.carry import carry
 from ..model.scene import Scene
 from ..model.surface import Surface, depth_at, project_visible, render_surface
+from ..model.uncertainty import LEVEL, point_errors
 from ..system.atomic import whole_folder
 from .axes import points_in_axes
 from .formats import ExportOptions, Format, Progress
 
-COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence")
+COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence", "across95", "along95")
 
 
 class QueryPoints(NamedTuple):
@@ -49,8 +50,10 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             first = render_surface(scene, times[0], cameras[0], options.min_alpha)
             queries = grid_query_points(first, options.grid_px)
         carried = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
-        pixels = np.empty((*carried.confidence.shape, 2), np.float32)
-        visible = np.empty(carried.confidence.shape, bool)
+        errors = point_errors(scene, carried, queries.frames, range(len(cameras)))
+        ranges = errors.across.half_width(LEVEL), errors.along()
+        pixels = np.empty((*errors.confidence.shape, 2), np.float32)
+        visible = np.empty(errors.confidence.shape, bool)
         for i, camera in enumerate(cameras):
             surface = render_surface(scene, times[i], camera, options.min_alpha)
             mask = sequence.frame(i).tissue_mask if sequence else None
@@ -62,13 +65,15 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             points=positions,
             pixels=pixels,
             visible=visible,
-            confidence=carried.confidence,
+            confidence=errors.confidence,
+            across95=ranges[0].astype(np.float32),
+            along95=ranges[1].astype(np.float32),
             times=np.array(times),
             start_frame=queries.frames,
             start_pixel=queries.pixels,
             axes=np.array(options.axes),
         )
-        table = _table(positions, pixels, visible, carried.confidence)
+        table = _table(positions, pixels, visible, errors.confidence, *ranges)
         (folder / "tracks.csv").write_text(table, encoding="utf-8", newline="\n")
 
 
@@ -134,7 +139,9 @@ def back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDAr
     return positions
 
 
-def _table(positions: NDArray, pixels: NDArray, visible: NDArray, confidence: NDArray) -> str:
+def _table(
+    positions: NDArray, pixels: NDArray, visible: NDArray, confidence: NDArray, across95: NDArray, along95: NDArray
+) -> str:
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)
@@ -142,7 +149,8 @@ def _table(positions: NDArray, pixels: NDArray, visible: NDArray, confidence: ND
         xyz = (f"{value:.4f}" for value in positions[i, p])
         uv = (f"{value:.3f}" if np.isfinite(value) else "" for value in pixels[i, p])
         time, shown = f"{i / len(visible):.6f}", int(visible[i, p])
-        rows.writerow((i, time, p, *xyz, *uv, shown, f"{confidence[i, p]:.3f}"))
+        ranges = (f"{value[i, p]:.4f}" if np.isfinite(value[i, p]) else "" for value in (across95, along95))
+        rows.writerow((i, time, p, *xyz, *uv, shown, f"{confidence[i, p]:.3f}", *ranges))
     return text.getvalue()
 
 

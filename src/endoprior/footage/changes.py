@@ -1,7 +1,6 @@
 """Detect changes that tissue motion does not cause: duplicates, exposure jumps, cuts, blur, views outside the body.
 
-Also combed images, of an interlaced video that its file does not flag as such. `T` successive images of one clip.
-Changes are measured on thumbnails, which suppresses noise.
+`T` successive images of one clip. Changes are measured on thumbnails, which suppresses noise.
 """
 
 from __future__ import annotations
@@ -36,13 +35,6 @@ COLOR_DISTANCE = 0.07
 """An image shows another scene if its mean red or green share differs by this from the median of the clip."""
 FOLLOWS = 0.9  # An image that follows from the one before has at least this correlation with it
 USUAL_RATE = 25.0  # Frame rate, 1/s, which decides how many images around an image it is compared with
-BLOCK_PX = 16
-LEAST_DIFFERENCE = 3.0  # Mean difference of neighboring rows, of 255, above which a block has structure
-RATIO = 1.3
-"""A block is combed if its neighboring rows differ more than rows two apart, by this factor; usually it is 0.55."""
-SHARE, LEAST_BLOCKS = 0.1, 8
-"""Least share of combed blocks, of those with structure. Progressive clips have up to 0.03, woven ones 0.07 to 1."""
-LEAST_IMAGES = 0.1  # Share of images that must be combed: without motion there is nothing to see
 
 
 @dataclass(frozen=True)
@@ -70,12 +62,20 @@ class _Measured(NamedTuple):
 
 
 def _measured(image: Image) -> _Measured:
-    size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * image.shape[0] / image.shape[1]))
-    color = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    color = _thumb(image)
     small = cv2.resize(image, small_size(image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
     quality = measure_quality(np.asarray(small, np.uint8), np.ones(small.shape[:2], bool))
-    thumb = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32)
-    return _Measured(thumb, color_share(color), _sharpness(image), quality)
+    return _Measured(_gray(color), color_share(color), _sharpness(image), quality)
+
+
+def _thumb(image: Image) -> NDArray[np.float32]:
+    """(h, w, 3) the image, small."""
+    size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * image.shape[0] / image.shape[1]))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def _gray(color: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32)
 
 
 def find_changes(images: Iterable[Image], each: InOrder = map) -> Changes:
@@ -87,10 +87,7 @@ def find_changes(images: Iterable[Image], each: InOrder = map) -> Changes:
     thumbs, shares, sharpness, qualities = zip(*each(_measured, images), strict=True)
     pairs, sharp = list(pairwise(thumbs)), np.array(sharpness)
     difference = np.array([np.abs(now - before).mean() for before, now in pairs], np.float64)
-    seconds = np.arange(len(thumbs)) / USUAL_RATE
-    small = _small(thumbs)
-    steps = np.array([0.0, *(change(before, now) for before, now in pairwise(small))])
-    cuts = tuple(i for i in np.flatnonzero(jumps(seconds, steps)).tolist() if _is_cut(thumbs, small, i))
+    seconds, cuts = np.arange(len(thumbs)) / USUAL_RATE, _cuts(thumbs)
     scene = np.isin(np.arange(len(thumbs)), cuts).cumsum()
     off_color = np.abs(shares - np.median(shares, axis=0)).max(1) > COLOR_DISTANCE
     return Changes(
@@ -104,6 +101,18 @@ def find_changes(images: Iterable[Image], each: InOrder = map) -> Changes:
         off_color=_places(_of_other_scenes(off_color, thumbs)),
         weights=disturbances(seconds, qualities, scene)[1],
     )
+
+
+def find_cuts(images: Iterable[Image], each: InOrder = map) -> tuple[int, ...]:
+    """`Changes.cuts` alone, in a fifth of the time. Args: as of `find_changes`."""
+    return _cuts(list(each(lambda image: _gray(_thumb(image)), images)))
+
+
+def _cuts(thumbs: Sequence[NDArray[np.float32]]) -> tuple[int, ...]:
+    small = _small(thumbs)
+    steps = np.array([0.0, *(change(before, now) for before, now in pairwise(small))])
+    found = np.flatnonzero(jumps(np.arange(len(thumbs)) / USUAL_RATE, steps)).tolist()
+    return tuple(i for i in found if _is_cut(thumbs, small, i))
 
 
 def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
@@ -188,26 +197,3 @@ def _is_cut(thumbs: Sequence[NDArray], small: Sequence[NDArray[np.float32]], fir
         return False
     places = [[first - k for k in ACROSS if k <= first], [first - 1 + k for k in ACROSS if first - 1 + k < len(thumbs)]]
     return not same_view(*([View(thumbs[i].astype(np.uint8)) for i in side] for side in places))
-
-
-def is_combed(rgb_u8: Image) -> bool:
-    """Whether moving parts of an image (H, W, 3) alternate from row to row."""
-    gray = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    rows, columns = ((side - 2) // BLOCK_PX for side in gray.shape)
-    if min(rows, columns) < 1:
-        return False
-    height, width = rows * BLOCK_PX, columns * BLOCK_PX
-    next_row, next_but_one = (
-        np.abs(gray[by : height + by, :width] - gray[:height, :width])
-        .reshape(rows, BLOCK_PX, columns, BLOCK_PX)
-        .mean((1, 3))
-        for by in (1, 2)
-    )
-    structured = next_row > LEAST_DIFFERENCE
-    combed = structured & (next_row > RATIO * next_but_one)
-    return bool(combed.sum() >= max(LEAST_BLOCKS, SHARE * structured.sum()))
-
-
-def are_combed(images: Sequence[Image]) -> bool:
-    """Whether images (H, W, 3) of a clip are those of an interlaced video."""
-    return sum(map(is_combed, images)) > LEAST_IMAGES * len(images)

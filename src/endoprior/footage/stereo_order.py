@@ -92,6 +92,11 @@ class StereoOrder:
         """Whether the first image is clearly that of the right camera."""
         return self.exchanged > self.as_given + CLEARLY
 
+    @property
+    def reason(self) -> str:
+        """The measurements in one line."""
+        return f"{self.as_given:.0%} of the image matches as given, {self.exchanged:.0%} swapped"
+
 
 def stereo_order(left_u8: Image, right_u8: Image) -> StereoOrder:
     """Match a rectified pair, (H, W, 3) each, as given and swapped: in the right order all disparities are positive."""

@@ -26,6 +26,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..compute.parallel_kernels import parallel_njit
 from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
@@ -198,7 +199,7 @@ def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float32]:
     return found
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def follow(pixels, there, back, tissue_mask):
     # Where pixels (N, 2) get to along the flow `there` (h, w, 2), and by how much `back` misses their start, (N,) px:
     # infinite where the point leaves the image or the tissue (H, W). Flow is in px of its own size, all else in px of

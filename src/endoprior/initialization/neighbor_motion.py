@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections import defaultdict
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+
+from ..compute.parallel_kernels import parallel_njit
 
 LEAST_SHARE = 0.34  # neighbors carry a point as long as those that are known have this share of the weight
 CARRIERS = 12  # known points that carry a lost one
@@ -81,7 +83,7 @@ def weights_by_distance(distances: NDArray[np.floating]) -> NDArray[np.floating]
     return weights / weights.sum(1, keepdims=True)
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def carry(positions, known, start, step, points, neighbors, weights, age):
     # Carry `points` (P,), lost after frame `start`, by the mean displacement of their `neighbors` (P, k) since then.
     # positions (T, N, 3) are written, and age (T, N), the frames since a position was measured, where `known` (T, N)
@@ -109,7 +111,7 @@ def carry(positions, known, start, step, points, neighbors, weights, age):
     return ends
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def mean_displacement(positions, source, points, neighbors, weights, offsets):
     # Set offsets (T, N, 3) of `points` (P,) to the mean displacement of `neighbors` (P, k) since frame `source`.
     for p in prange(len(points)):

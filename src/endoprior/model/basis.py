@@ -32,7 +32,7 @@ from .motion import Field, Gradient, Motion, Offsets, RankOneGradient
 
 if TYPE_CHECKING:
     from .gaussians import Gaussians
-    from .ops import ModelOps
+    from .ops_interface import ModelOps
 
 
 TRAINED, GIVEN = ("motion", "changes"), ("frame_motion",)

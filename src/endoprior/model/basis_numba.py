@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..compute.parallel_kernels import parallel_njit
 from ..compute.simd import LANES, prefetch
 
 _CHUNK = 256  # Gaussians per task
@@ -37,7 +38,7 @@ def _support(weights: NDArray) -> tuple[int, int]:
     return (int(support[0]), int(support[-1]) + 1) if len(support) else (0, 0)
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _weighted_sum(motion, weights, first, stop, out):
     # One task per chunk of Gaussians; writes out (N, channels).
     num, channels = out.shape
@@ -56,7 +57,7 @@ def _weighted_sum(motion, weights, first, stop, out):
                     out[n, c] += weights[b] * motion[n, b, c]
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _weighted_sum_backward(v_out, weights, first, stop, v_motion):
     # One task per chunk of Gaussians; writes v_motion (N, B, channels) for b in [first, stop); the rest stays 0.
     num, channels = v_out.shape

@@ -18,11 +18,8 @@ from .single_scene import SingleScene
 
 NUM_CARRIERS = 8
 """Gaussians that carry a point."""
-NEAR_PX = 4.0
-"""Confidence is the probability of an error below this, px of an image 640 px wide."""
-LEAST_ERROR_PX, ERROR_PER_SPREAD = 1.3, 0.65
-"""Deviation of a carried point's error, px of such an image: what remains where its carriers agree, and what is added
-for each px by which they disagree. Fitted to two phantoms (docs/log.md)."""
+TIED_ANEW_PX = 1.0
+"""Spread that each further window adds: its Gaussians may be tied to other tissue. Assumed, not measured."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +27,9 @@ class CarriedPoints:
     """P points at T times."""
 
     positions: NDArray[np.float32]  # (T, P, 3) world, mm
-    confidence: NDArray[np.float32]  # (T, P) in [0, 1]; greatest in the point's own frame, less in each further window
+    spread_px: NDArray[np.float64]
+    """(T, P) by how much the Gaussians that carry a point disagree about its way since its own frame, px of an image
+    640 px wide; of all windows that it passed, added in squares."""
 
 
 def carry_points(
@@ -58,7 +57,7 @@ def carry(scene: Scene, points: NDArray, from_frame: NDArray[np.intp], times: li
     home = np.searchsorted(borders, at, side="right")  # the window of each time, and of each point
     own = home[from_frame]
     positions = np.empty((len(times), *points.shape), np.float32)
-    variance = np.empty(positions.shape[:2])
+    square = np.empty(positions.shape[:2])  # of the spread
     for onwards in (True, False) if len(windows) > 1 else (True,):
         here, doubt = np.array(points, np.float64), np.zeros(len(points))
         for k in range(home.max() + 1) if onwards else range(len(windows) - 1, home.min() - 1, -1):
@@ -71,17 +70,17 @@ def carry(scene: Scene, points: NDArray, from_frame: NDArray[np.intp], times: li
             since = np.where(own[moved] == k, np.searchsorted(asked, from_frame[moved]), enters)
             found, added = _carry_in(windows[k], here[moved], since, stops)
             positions[np.ix_(asked, moved)] = found[: len(asked)]
-            variance[np.ix_(asked, moved)] = doubt[moved] + added[: len(asked)]
+            square[np.ix_(asked, moved)] = doubt[moved] + added[: len(asked)]
             leaves = len(asked) + (len(ends) - 1 if onwards else 0)
             if leaves < len(stops):
-                here[moved], doubt[moved] = found[leaves], doubt[moved] + added[leaves]
-    return CarriedPoints(positions, _probability(variance))
+                here[moved], doubt[moved] = found[leaves], doubt[moved] + added[leaves] + TIED_ANEW_PX**2
+    return CarriedPoints(positions, np.sqrt(square))
 
 
 def _carry_in(
     window: Window, points: NDArray, from_stop: NDArray[np.intp], stops: list[float]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """(T, P, 3) positions and (T, P) variance of their error, px squared, within one window.
+    """(T, P, 3) positions and (T, P) squared spread of their carriers, px squared, within one window.
 
     Args:
         from_stop: (P,) position in `stops` at which each point is where `points` says.
@@ -108,14 +107,13 @@ def _carry_in(
         tied = from_stop == start
         at_start[tied] = _centers(scene, chosen, times[start])[own[tied]]
     positions = np.empty((len(times), *points.shape), np.float32)
-    variance = np.empty(positions.shape[:2])
+    square = np.empty(positions.shape[:2])
     for i, time in enumerate(times):  # one time after the other: many points at many times fit in memory
         displacements = _centers(scene, chosen, time)[own] - at_start
         mean = np.einsum("pkc,pk->pc", displacements, weights)
         positions[i] = points + mean
-        spread = _spread_px(displacements - mean[:, None], weights, positions[i], scene.camera_at(time))
-        variance[i] = _variance(spread)
-    return positions, variance
+        square[i] = _spread_px(displacements - mean[:, None], weights, positions[i], scene.camera_at(time)) ** 2
+    return positions, square
 
 
 def centers_then(scene: Scene, time: float, then: float) -> NDArray[np.float32]:
@@ -124,24 +122,6 @@ def centers_then(scene: Scene, time: float, then: float) -> NDArray[np.float32]:
         return scene.at(then).means.cpu().numpy()
     centers = scene.at(time).means.cpu().numpy()
     return carry_points(scene, centers, np.zeros(len(centers), np.intp), [time, then])[1]
-
-
-def confidence_of(spread_px: NDArray) -> NDArray:
-    """Probability that a carried point is less than `NEAR_PX` from the truth: both parts of its error are normal.
-
-    Args:
-        spread_px: (...) by how much its carriers disagree about its motion, px of an image 640 px wide.
-    """
-    return _probability(_variance(spread_px))
-
-
-def _variance(spread_px: NDArray) -> NDArray:
-    """Of the error of a carried point, px squared of an image 640 px wide."""
-    return LEAST_ERROR_PX**2 + (ERROR_PER_SPREAD * spread_px) ** 2
-
-
-def _probability(variance: NDArray) -> NDArray:
-    return 1 - np.exp(-0.5 * NEAR_PX**2 / variance)
 
 
 def _spread_px(deviations: NDArray, weights: NDArray, points: NDArray, camera: Camera) -> NDArray:

@@ -123,7 +123,7 @@ class PlaneGrid:
 
     def to(self, device: torch.device) -> PlaneGrid:
         """A copy on a device, without gradients."""
-        moved = self._copy(self.values.detach().to(device))
+        moved = self._copy(self.values.detach().to(device, torch.float32))
         moved.marks = self.marks.to(device)
         moved.grads = moved.zeros()
         return moved

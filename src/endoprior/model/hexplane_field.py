@@ -24,7 +24,7 @@ from ..core.config_deformation import DeformationConfig, HexPlaneConfig
 from .gaussians import Gaussians, offset_widths
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
 from .motion import Field, Motion, Offsets
-from .ops import ModelOps
+from .ops_interface import ModelOps
 
 
 class HexPlaneField(Field):

@@ -29,6 +29,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from ..compute.parallel_kernels import parallel_njit
 from ..compute.simd import LANES, fma, load_some, prefetch, splat, store_some, total
 from .hexplane import FRESH, TOUCHED
 
@@ -126,7 +127,7 @@ def _expect(array, cells, c, steps):
         prefetch(array, place + down + step)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def slice_time(values, channels, time_start, table_start, resolution, rows, fractions, tables):
     # Interpolates the time planes at the given times: tables = lerp of plane rows `rows[m]` and `rows[m] + 1`. One task
     # per plane.
@@ -142,7 +143,7 @@ def slice_time(values, channels, time_start, table_start, resolution, rows, frac
                     tables[target + c] = values[below + c] + fractions[m] * (values[above + c] - values[below + c])
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def gather(unit, values, channels, tables, num_times, layout, features):
     # Writes `features`, the products of the six plane samples. One task per chunk of Gaussians.
     num = len(unit)
@@ -195,7 +196,7 @@ def _gather_block(c, lanes, values, tables, num_times, cells, columns, fractions
         store_some(features, m * stride + place + c, space * in_time, lanes)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def scatter(
     unit, values, channels, tables, num_times, layout, features, grads, v_tables, marks, table_marks, v_unit, share
 ):
@@ -298,7 +299,7 @@ def _mark(marks, cell, width):
     marks[cell] = marks[cell + 1] = marks[cell + width] = marks[cell + width + 1] = TOUCHED | FRESH
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def slice_time_backward(
     v_tables, channels, table_marks, time_start, table_start, resolution, rows, fractions, grads, marks
 ):

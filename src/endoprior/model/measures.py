@@ -5,6 +5,7 @@ Lengths are in the unit of the points: mm, or `rel.` where the scale is unknown.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +13,12 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..core.geometry import back_project, pixel_centers
+from ..core.strain import Strain, strain_of
+from ..core.types import Camera
 from .carry import carry_points
 from .scene import Scene
 from .surface import render_surface
+from .uncertainty import PointErrors
 
 NUM_NEIGHBORS = 24
 """Surface points around a point that its stretch is fit to."""
@@ -35,13 +39,26 @@ class Measures:
     path_length_raw: NDArray[np.float64]  # (T, P) without smoothing: jitter counts
     displacement: NDArray[np.float64]  # (T, P) distance from the position in frame `since`
     stretch: NDArray[np.float64]  # (T, P) largest principal stretch of the surface around the point; 1: unchanged
+    ranges: Ranges | None = None  # None: the errors of the points are not known
 
 
-def measures_of(paths: NDArray, stretch: NDArray, since: int, drawn: int) -> Measures:
+@dataclass(frozen=True)
+class Ranges:
+    """Half of the range around each measure that holds 95 % of the true values: see `uncertainty`."""
+
+    distance: NDArray[np.float64]  # (T,)
+    area: NDArray[np.float64]  # (T,)
+    displacement: NDArray[np.float64]  # (T, P)
+
+
+def measures_of(
+    paths: NDArray, stretch: NDArray, since: int, drawn: int, errors: PointErrors | None = None
+) -> Measures:
     """Every measure of carried points: paths (T, P, 3), stretch (T, P).
 
     Args:
         since: frame that displacement refers to. drawn: frame in which the polygon is cut into triangles.
+        errors: of the points, for the ranges.
     """
     paths = paths.astype(np.float64)
     unknown = np.full(len(paths), np.nan)
@@ -54,7 +71,29 @@ def measures_of(paths: NDArray, stretch: NDArray, since: int, drawn: int) -> Mea
         path_length(paths),
         distance(paths, paths[since]),
         stretch,
+        None if errors is None else ranges_of(paths, since, triangles, errors),
     )
+
+
+def ranges_of(paths: NDArray, since: int, triangles: NDArray[np.intp], errors: PointErrors) -> Ranges:
+    """To first order in the errors of the points (T, P, 3), which are independent of each other."""
+    unknown = np.full(len(paths), np.nan)
+    ends = np.zeros_like(paths)
+    if paths.shape[1] > 1:
+        ends[:, 0] = unit_vectors(paths[:, 0] - paths[:, 1])
+        ends[:, 1] = -ends[:, 0]
+    way = unit_vectors(paths - paths[since])
+    now, then = (each.half_width(way, since_pick=True) for each in (errors, errors.at(slice(since, since + 1))))
+    return Ranges(
+        np.sqrt(np.square(errors.half_width(ends)).sum(1)) if paths.shape[1] > 1 else unknown,
+        np.sqrt(np.square(errors.half_width(area_gradient(paths, triangles))).sum(1)) if len(triangles) else unknown,
+        np.hypot(now, then),
+    )
+
+
+def unit_vectors(vectors: NDArray) -> NDArray[np.float64]:
+    """(..., 3) vectors of length 1 in the same directions; 0 stays 0."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12), np.float64)
 
 
 def distance(a: NDArray, b: NDArray) -> NDArray[np.float64]:
@@ -85,6 +124,17 @@ def area(corners: NDArray, triangles: NDArray[np.intp]) -> NDArray[np.float64]:
     """(T,) summed area of flat triangles (F, 3) between corners (T, P, 3)."""
     a, b, c = (corners[:, triangles[:, k]] for k in range(3))
     return np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum(1) / 2
+
+
+def area_gradient(corners: NDArray, triangles: NDArray[np.intp]) -> NDArray[np.float64]:
+    """(T, P, 3) by how much `area` grows as each corner moves."""
+    found = np.zeros(corners.shape)
+    for a, b, c in (np.roll(triangles, -k, 1).T for k in range(3)):
+        normal = unit_vectors(np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a]))
+        pushes = np.cross(normal, corners[:, c] - corners[:, b]) / 2
+        for k, corner in enumerate(a):
+            found[:, corner] += pushes[:, k]
+    return found
 
 
 def polygon_triangles(corners: NDArray) -> NDArray[np.intp]:
@@ -133,8 +183,8 @@ def neighborhoods(points: NDArray, samples: NDArray) -> tuple[NDArray[np.intp], 
     return nearest, far[:, 0] <= scatter
 
 
-def principal_stretches(before: NDArray, after: NDArray) -> NDArray[np.float64]:
-    """Stretch of pieces of a surface: singular values of the deformation gradient that fits best.
+def fitted_strain(before: NDArray, after: NDArray) -> Strain:
+    """Strain of pieces of a surface: that of the deformation gradient that fits best.
 
     The tangent plane of a piece is the one through its points before, by least squares. The gradient, a (3, 2) matrix,
     takes positions in this plane to positions after, by least squares. Turning and moving a piece changes nothing,
@@ -143,8 +193,7 @@ def principal_stretches(before: NDArray, after: NDArray) -> NDArray[np.float64]:
     Args:
         before, after: (..., K, 3) the same K points.
     Returns:
-        (..., 2) largest and smallest: length after over length before, along two perpendicular directions; NaN where a
-        point is unknown, or all lie on a line.
+        NaN where a point is unknown, or all lie on a line.
     """
     known = np.asarray(np.isfinite(before).all((-2, -1)) & np.isfinite(after).all((-2, -1)))
     before, after = (np.where(known[..., None, None], points, 0.0) for points in (before, after))
@@ -153,7 +202,8 @@ def principal_stretches(before: NDArray, after: NDArray) -> NDArray[np.float64]:
     known = known & (variances[..., 1] > THINNEST * variances[..., 2])
     scale = np.where(known[..., None], variances[..., 1:], 1.0)
     gradient = np.swapaxes(after, -1, -2) @ (before @ axes[..., 1:]) / scale[..., None, :]
-    return np.where(known[..., None], np.linalg.svd(gradient, compute_uv=False), np.nan)
+    strain = strain_of(gradient, axes[..., 1:])
+    return Strain(*(np.where(known[..., None], values, np.nan) for values in strain))
 
 
 def _turn(a: NDArray, b: NDArray, c: NDArray) -> float:
@@ -192,34 +242,55 @@ class SurfaceMotion:
         """Render the surface of frame `since`, and sample it on a grid."""
         self._scene, self.since = scene, since
         surface = render_surface(scene, self._time(since), scene.cameras[since], min_alpha)
-        step = max(surface.camera.width // SAMPLE_COLUMNS, 1)
-        depth = surface.depth[step // 2 :: step, step // 2 :: step]
-        pixels = pixel_centers(surface.camera.width, surface.camera.height)[step // 2 :: step, step // 2 :: step]
-        seen = depth > 0
-        self.samples = back_project(pixels[seen].astype(np.float64), depth[seen].astype(np.float64), surface.camera)
+        self.samples = surface_samples(surface.depth, surface.camera)
         """(S, 3) points of the surface in that frame, world axes, mm."""
 
     def _time(self, frame: int) -> float:
         return frame / len(self._scene.cameras)
 
     def stretch(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """(F, P) largest principal stretch, in each of `frames`, around points (P, 3), mm, of the surface's frame.
+        """(F, P) largest principal stretch of `strain`."""
+        return self.strain(points, frames).stretch[..., 0]
 
-        1: unchanged; NaN for points that are not on the surface.
+    def strain(self, points: NDArray, frames: list[int]) -> Strain:
+        """(F, P) strain, in each of `frames`, around points (P, 3), mm, of the surface's frame; world axes.
+
+        NaN for points that are not on the surface.
         """
-        found = np.full((len(frames), len(points)), np.nan)
-        on_surface = np.asarray(np.isfinite(points).all(1))
-        if not len(self.samples) or not on_surface.any():
-            return found
-        nearest, around = neighborhoods(points[on_surface], self.samples)
-        used, places = np.unique(nearest[around], return_inverse=True)
-        on_surface[on_surface] = around
-        if not len(used):
-            return found
-        before = self.samples[used]
-        times = [self._time(frame) for frame in (self.since, *frames)]
-        moved = carry_points(self._scene, before, np.zeros(len(used), np.intp), times)[1:].astype(np.float64)
-        places = places.reshape(-1, nearest.shape[1])
-        for found_there, after in zip(found, moved, strict=True):
-            found_there[on_surface] = principal_stretches(before[places], after[places])[:, 0]
+
+        def carried(samples: NDArray) -> NDArray:
+            times = [self._time(frame) for frame in (self.since, *frames)]
+            return carry_points(self._scene, samples, np.zeros(len(samples), np.intp), times)[1:]
+
+        return strain_around(points, self.samples, len(frames), carried)
+
+
+def strain_around(points: NDArray, samples: NDArray, count: int, carried: Callable[[NDArray], NDArray]) -> Strain:
+    """(F, P) strain around points (P, 3) at F = `count` times; NaN for points that are not on the surface.
+
+    Args:
+        samples: (S, 3) points of the surface. carried: gives the positions (F, N, 3) at these times of N of them.
+    """
+    found = Strain(np.full((count, len(points), 2), np.nan), np.full((count, len(points), 3), np.nan))
+    on_surface = np.asarray(np.isfinite(points).all(1))
+    if not len(samples) or not on_surface.any():
         return found
+    nearest, around = neighborhoods(points[on_surface], samples)
+    used, places = np.unique(nearest[around], return_inverse=True)
+    on_surface[on_surface] = around
+    if not len(used):
+        return found
+    before, places = samples[used], places.reshape(-1, nearest.shape[1])
+    for k, after in enumerate(carried(before).astype(np.float64)):
+        strain = fitted_strain(before[places], after[places])
+        found.stretch[k, on_surface], found.direction[k, on_surface] = strain
+    return found
+
+
+def surface_samples(depth: NDArray, camera: Camera) -> NDArray[np.float64]:
+    """(S, 3) points of the surface that a camera sees, on a grid; depth (H, W) z, mm, 0 where unknown. World axes."""
+    step = max(camera.width // SAMPLE_COLUMNS, 1)
+    depth = depth[step // 2 :: step, step // 2 :: step]
+    pixels = pixel_centers(camera.width, camera.height)[step // 2 :: step, step // 2 :: step]
+    seen = depth > 0
+    return back_project(pixels[seen].astype(np.float64), depth[seen].astype(np.float64), camera)

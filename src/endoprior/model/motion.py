@@ -26,7 +26,7 @@ from .gaussians import attribute_shapes
 if TYPE_CHECKING:
     from .gaussians import Gaussians
     from .hexplane import PlaneGrid
-    from .ops import ModelOps
+    from .ops_interface import ModelOps
 
 
 @dataclass(frozen=True)

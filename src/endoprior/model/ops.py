@@ -5,29 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import torch
-from torch import Tensor
 
 from . import basis, basis_numba, hexplane, hexplane_numba
-
-
-@dataclass(frozen=True)
-class ModelOps:
-    """One implementation of each operation."""
-
-    name: str
-    weighted_sum: Callable[..., Tensor]
-    """Offsets from temporal coefficients: see `basis.weighted_sum`."""
-    weighted_sum_backward: Callable[..., Tensor]
-    """Its gradient: see `basis.weighted_sum_backward`."""
-    hexplane_linear: Callable[..., tuple[Tensor, ...]]
-    """A linear layer on HexPlane features: see `hexplane.hexplane_linear`."""
-    fuse_heads: bool
-    """Compute the hidden layers of all heads as one matrix product: fewer and larger launches on a GPU."""
-
+from .ops_interface import ModelOps
 
 NUMBA = ModelOps(
     "numba",

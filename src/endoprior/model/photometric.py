@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import interpolate
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 from ..core.types import RenderedView
 
 GRID = (18, 24)
@@ -66,7 +67,7 @@ class _Filmed(torch.autograd.Function):
         return ctx.slope.mul_(v_shown), None
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _rows(color, grid, shown, slope):
     # One task per row y: writes shown[y] and slope[y] = d shown / d color. A row is one flat run of numbers, three per
     # pixel: loops over it vectorize.

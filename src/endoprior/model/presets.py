@@ -9,7 +9,7 @@ import re
 from dataclasses import replace
 from typing import Any, Literal
 
-from ..core.checks import InputError
+from ..core.checks import input_error, or_did_you_mean
 from ..core.config import Config, ReleasedMethod
 from ..system.plugins import Registry
 
@@ -21,9 +21,15 @@ def preset(name: str = "default", **changes: Any) -> Config:
         changes: other values, by names that `Config.replace` knows; `iterations` changes the whole schedule.
     Raises:
         InputError: no preset or field has this name, or a value has the wrong type or range.
+
+    Example:
+        >>> import endoprior
+        >>> endoprior.preset("default", seed=1, gaussians=10_000).init.budget
+        10000
     """
     if name not in preset_names():
-        raise InputError(f"preset: expected one of {', '.join(preset_names())}; got {name!r}. Choose one of them.")
+        fix = or_did_you_mean("choose one of them.", name, preset_names())
+        raise input_error("preset", f"one of {', '.join(preset_names())}", repr(name), fix)
     made = PRESETS.load(name)()
     return made.replace(changes) if changes else made
 

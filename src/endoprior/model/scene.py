@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from .. import render
+from ..core.checks import input_error
 from ..core.config import Config
 from ..core.types import Camera, RenderedView, Splats
 from .method import Method, method_of
@@ -94,11 +95,19 @@ class RenderedScene(ABC):
         """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
 
         Returns:
-            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, alpha (H, W) in [0, 1], and
-            unclamped_color (H, W, 3).
+            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, expected_depth (H, W) mm, which is
+            divided by alpha, alpha (H, W) in [0, 1], and unclamped_color (H, W, 3).
         Raises:
             ValueError: time is not in [0, 1].
         """
+
+    def at(self, time: float, camera: Camera | None = None) -> Splats:
+        """The Gaussians at `time`, activated; see `Scene.at`.
+
+        Raises:
+            InputError: it is a radiance field, which has none.
+        """
+        return with_gaussians(self).at(time, camera)
 
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
         """`render` at several times, one camera each."""
@@ -178,6 +187,11 @@ class Scene(RenderedScene):
         seen_by = camera or self.camera_at(time)
         return rendered(self.parts_at(time, seen_by), seen_by, self.backend, self.background)
 
+    def window_at(self, frame: int) -> tuple[SingleScene, int]:
+        """The scene that shows most of a frame, and the position of that frame in it."""
+        part = max(self.shown_at(frame / len(self.cameras)), key=lambda shown: shown.weight)
+        return part.window.scene, frame - part.window.start
+
     def smoke_at(self, time: float) -> Tensor | None:
         """See `RenderedScene.smoke_at`."""
         found = [(part.window.scene.smoke, part) for part in self.shown_at(time)]
@@ -211,6 +225,14 @@ class Scene(RenderedScene):
             if backend is not None and (backend in render.ON_GPU) == on_gpu:
                 return backend
         return "gsplat" if on_gpu else "numba"
+
+
+def with_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> Scene:
+    """The scene; InputError, which names `subject`, if it is a radiance field."""
+    if not isinstance(scene, Scene):
+        fix = "`endoprior render RUN` makes images and a video of it."
+        raise input_error(subject, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)
+    return scene
 
 
 def faded_in(place: float) -> float:

@@ -38,6 +38,8 @@ class SceneFacts(Checked):
     trained_until: Annotated[float, Range(0, 1)] = 1.0
     baseline_mm: Annotated[float, Range(0, 1e6)] = 0.0
     smoke: bool = False
+    tissue: bool = False
+    depth_noise: Annotated[float, Range(0, 10)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

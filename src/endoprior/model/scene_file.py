@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from ..compute.parallel_kernels import demand_unforked
 from ..core.checks import InputError, input_error
 from ..core.config import OWN, Config
 from ..core.config_io import from_dict
@@ -25,6 +26,7 @@ from .photometric import GRID
 from .scene import RenderedScene
 from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SceneFacts, camera_arrays, demand
 from .single_scene import FORMAT, SingleScene
+from .uncertainty import CELLS
 from .windowed_scene import Span, WindowedScene, window_file
 
 MOST_FRAMES = 1_000_000
@@ -42,7 +44,15 @@ def load_scene(path: str | Path) -> RenderedScene:
 
     Raises:
         InputError: there is no such file, or it is not a scene this version can read.
+        RuntimeError: this process is a fork of one that has rendered or trained.
+
+    Example:
+        >>> import endoprior
+        >>> scene = endoprior.load_scene("RUN")
+        >>> scene.at(time=0.5).means.shape[1], len(scene.cameras)
+        (3, 10)
     """
+    demand_unforked()
     path = Path(path)
     file = path / "scene.safetensors" if os.path.isdir(path) else path
     if not os.path.isfile(file):  # of a name too long for the system pathlib would raise
@@ -63,7 +73,8 @@ def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a scene's file of this description; `T` frames."""
     cfg = _config(about)
     smoke = {"smoke": ArraySpec("float32", ("T", *GRID, 2))} if about.get("smoke") else {}
-    return method_of(cfg).schema(cfg) | CAMERAS | smoke
+    tissue = {"tissue": ArraySpec("uint8", ("T", *CELLS))} if about.get("tissue") else {}
+    return method_of(cfg).schema(cfg) | CAMERAS | smoke | tissue
 
 
 def _config(about: dict[str, Any]) -> Config:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .. import render
+from ..compute.parallel_kernels import demand_unforked
 from ..core.config import Config
 from ..core.types import Camera, Splats
 from ..footage.stereo_order import share_of_right
@@ -51,6 +52,10 @@ class SingleScene(Scene):
     """From the left to the right camera, where both were trained on: what `gloss` is seen from; 0: from nowhere."""
     smoke: Tensor | None = None
     """(T, I, J, 2) gain and veil of each frame: see `photometric`; None: no smoke."""
+    tissue: Tensor | None = None
+    """(T, I, J) share of each cell of the frame that is tissue, 0..255: see `uncertainty`; None: not known."""
+    depth_noise: float = 0.0
+    """How far rendered depth is from measured depth, as a share of it; 0: not known."""
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -63,6 +68,7 @@ class SingleScene(Scene):
     @torch.no_grad()
     def at(self, time: float, camera: Camera | None = None) -> Splats:
         """See `Scene.at`."""
+        demand_unforked()  # torch would wait for threads that are not there, before the first kernel is reached
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
         share = 0.0
@@ -149,6 +155,8 @@ class SingleScene(Scene):
             facts.trained_until,
             baseline_mm=facts.baseline_mm,
             smoke=arrays.get("smoke"),
+            tissue=arrays.get("tissue"),
+            depth_noise=facts.depth_noise,
         )
 
     def save(self, path: Path) -> None:
@@ -165,4 +173,8 @@ class SingleScene(Scene):
             about["baseline_mm"] = self.baseline_mm
         if self.smoke is not None:
             arrays["smoke"], about["smoke"] = self.smoke, True
+        if self.tissue is not None:
+            arrays["tissue"], about["tissue"] = self.tissue, True
+        if self.depth_noise:
+            about["depth_noise"] = self.depth_noise
         save_arrays(path, arrays, scene_facts(self) | about, FORMAT)

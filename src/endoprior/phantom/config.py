@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
-from ..core.checks import input_error
+from ..core.checks import input_error, or_did_you_mean
 from .events import parse_events
 
 MOST_PIXELS = 3840 * 2160
@@ -21,10 +21,13 @@ Instruments = Literal[
 ]  # fmt: skip
 Gain = Literal["fixed", "auto"]
 Tissue = Literal["bowel", "pale", "fat", "purple", "liver", "warm", "smoke", "blood"]
+Mechanics = Literal["none", "pull", "poke", "breathe"]
 Border = Literal["none", "octagon", "oval", "rounded"]
 
 NARROW_PULL_MM = 15.0
 """Up to this pull, mm, the moved neighborhood keeps its size; beyond, it grows in proportion, or tissue would fold."""
+MOST_MECHANICS_MM = 12.0
+"""Largest pull of `mechanics`, mm: of 60 pulls (seeds 0 to 19) by 12 mm none folds the tissue, of 60 by 15 mm one."""
 
 
 def _require(name: str, value: float, low: float, high: float) -> None:
@@ -54,6 +57,9 @@ class PhantomConfig:
     """Kind of tissue and view: its color, vessels and gloss; `warm` light; `smoke` that comes and goes; `blood`."""
     smoke: float = 0.0
     """Light that smoke takes, 0..0.95. The share that is lost in the densest puff within 80 mm; `truth/` shows none."""
+    mechanics: Mechanics = "none"
+    """Motion of an elastic sheet; true stretch. `truth/mechanics.npz` holds it. The sheet is pulled, poked, or spread
+    by breathing, in place of the usual motion."""
     gain: Gain = "fixed"
     """`auto`: exposure follows brightness with a lag; truth/tissue keeps the first one."""
     camera: Literal["still", "inspect"] = "still"
@@ -79,7 +85,8 @@ class PhantomConfig:
     breathing_mm: float = 3.0
     """Peak-to-peak breathing motion of the tissue, mm, 0..8."""
     pull_mm: float = 12.0
-    """Distance by which the grasper pulls the tissue, mm, 0..30. Beyond 15 mm the pull is also wider."""
+    """Distance by which the grasper pulls the tissue, mm, 0..30. Beyond 15 mm the pull is also wider. With `mechanics`
+    pulled or poked, 0..12."""
     slide_mm: float = 0.0
     """Distance the tissue slides to each side, mm: its rim leaves and returns. 0..12, less with a narrow view."""
     smooth_share: float = 0.0
@@ -113,13 +120,22 @@ class PhantomConfig:
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
-        choices = {"instruments": Instruments, "tissue": Tissue, "border": Border, "gain": Gain}
+        choices = {"instruments": Instruments, "tissue": Tissue, "border": Border, "gain": Gain, "mechanics": Mechanics}
         for name, known in ((name, get_args(kinds)) for name, kinds in choices.items()):
             if getattr(self, name) not in known:
-                raise input_error(name, f"one of {', '.join(known)}", repr(getattr(self, name)), "Choose one of these.")
+                typed = str(getattr(self, name))
+                fix = or_did_you_mean("Choose one of these.", typed, known)
+                raise input_error(name, f"one of {', '.join(known)}", repr(typed), fix)
         parse_events(self.events, self.frames)
         if self.scene != "cavity":
-            self._require_no_cavity()
+            kept = ("scene", "frames", "width", "height", "seed", "baseline_mm", "focal_per_width", "principal_x")
+            kept += ("principal_y", "frames_per_second", "noise", "depth_noise_px", "tracks", "border")
+            others = tuple(field.name for field in fields(self) if field.name not in kept)
+            self._require_default(others, f"--scene {self.scene}", "which belongs to `cavity`")
+        if self.mechanics != "none":
+            unused = ("breathing_mm",) if self.mechanics != "breathe" else ("pull_mm",)
+            self._require_default(("slide_mm", *unused), f"--mechanics {self.mechanics}", "which it has no use for")
+            _require("pull_mm with --mechanics", self.pull_mm, 0, MOST_MECHANICS_MM)
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
         if self.width * self.height * share > MOST_PIXELS:
@@ -136,16 +152,12 @@ class PhantomConfig:
         _require("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)
         _require("principal_y", self.center[1], 0.35 * self.height, 0.65 * self.height)
 
-    def _require_no_cavity(self) -> None:
-        """Raise InputError if an option is set that belongs to the other scene."""
-        kept = ("scene", "frames", "width", "height", "seed", "baseline_mm", "focal_per_width", "principal_x")
-        kept += ("principal_y", "frames_per_second", "noise", "depth_noise_px", "tracks", "border")
+    def _require_default(self, names: tuple[str, ...], given: str, why: str) -> None:
+        """Raise InputError if one of these options is set, `why` it is not taken with what is `given`."""
         for field in fields(self):
-            if field.name not in kept and getattr(self, field.name) != field.default:
+            if field.name in names and getattr(self, field.name) != field.default:
                 option = "--" + field.name.replace("_", "-")
-                raise input_error(
-                    f"--scene {self.scene}", f"no {option}, which belongs to `cavity`", "one", f"Remove {option}."
-                )
+                raise input_error(given, f"no {option}, {why}", "one", f"Remove {option}.")
 
     @property
     def has_regions(self) -> bool:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.strain import strain_between
 from ..data.sequence import is_test_frame
 from ..data.writer import FrameFiles, SequenceMeta, new_sequence
 from .camera import STILL, Eye
@@ -17,6 +18,7 @@ from .config import PhantomConfig
 from .events import Event, disturbed, is_mirrored, parse_events, shows_body
 from .scene import Moment, Scene, build_scene
 from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth, vignette
+from .sheet import tangents
 from .sinus import build_sinus
 from .texture import smooth_patches
 from .tube import build_tube, write_tube
@@ -106,7 +108,9 @@ def _regions(scene: Scene, tracked: NDArray[np.int64]) -> NDArray[np.str_]:
 
 
 def write_phantom(
-    out: Path, cfg: PhantomConfig, progress: Callable[[int, int], None] = lambda _done, _total: None
+    out: str | Path,
+    cfg: PhantomConfig | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> None:
     """Write a synthetic sequence folder with ground truth to `out`.
 
@@ -129,6 +133,9 @@ def write_phantom(
     - with `cfg.border` `truth/border.npy`, (H, W) bool, True outside; with `cfg.overlay` `truth/overlay/*.npy`, True
       on the drawing;
     - of the scenes `tube` and `sinus` only tissue, depth, tracks and the camera's poses;
+    - with `cfg.mechanics` `truth/mechanics.npz`: of the tracked points, since the first frame, `displacement` (T, P, 3)
+      mm, principal `stretch` (T, P, 2), `direction` (T, P, 3) of the larger one in the first frame and `area` (T, P)
+      after over before, float32, in the axes of the first frame's camera;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
 
     Args:
@@ -136,7 +143,13 @@ def write_phantom(
         progress: called with (frames done, frames) after each frame.
     Raises:
         InputError: `out` is in use.
+
+    Example:
+        >>> import endoprior
+        >>> from endoprior.phantom import PhantomConfig
+        >>> endoprior.phantom("DATA", PhantomConfig(frames=10, width=64, height=48))
     """
+    out, cfg = Path(out), cfg or PhantomConfig()
     with new_sequence(out, _meta(cfg)) as writer:
         outside = border(cfg)
         if cfg.border != "none":
@@ -197,10 +210,33 @@ def write_phantom(
             hits = pixel_hits(scene.seen_vertices(index / (cfg.frames - 1)), cfg)
             tool = np.unpackbits(packed, count=hits[..., 0].size).reshape(hits.shape[:2]) > 0
             writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, ever_seen, tool))
-        regions = {"region": _regions(scene, tracked)} if cfg.has_regions else {}
-        tracks = {"points": np.stack(points).astype(np.float32), "visible": np.stack(visible)}
-        writer.write_arrays("truth/tracks.npz", **tracks, **regions)
+        _write_tracks(writer, scene, tracked, points, visible)
         _write_descriptions(writer, scene, sides, gains)
+
+
+def _write_tracks(
+    writer: FrameFiles, scene: Scene, tracked: NDArray[np.int64], points: list[NDArray], visible: list[NDArray]
+) -> None:
+    """The tracks, from `points` (P, 3) and `visible` (P,) of each frame; how their tissue is deformed."""
+    regions = {"region": _regions(scene, tracked)} if scene.cfg.has_regions else {}
+    tracks = {"points": np.stack(points).astype(np.float32), "visible": np.stack(visible)}
+    writer.write_arrays("truth/tracks.npz", **tracks, **regions)
+    if scene.cfg.mechanics != "none":
+        writer.write_arrays("truth/mechanics.npz", **_deformed(scene, tracked))
+
+
+def _deformed(scene: Scene, tracked: NDArray[np.int64]) -> dict[str, NDArray[np.float32]]:
+    """What `truth/mechanics.npz` says of the tracked vertices (P, 2); the tissue is undeformed in the first frame."""
+    rows, columns = tracked.T
+    rest = scene.vertices(0)
+    found: dict[str, list[NDArray]] = {"displacement": [], "stretch": [], "direction": [], "area": []}
+    for index in range(scene.cfg.frames):
+        now = scene.vertices(index / (scene.cfg.frames - 1))
+        strain = strain_between(tangents(rest)[rows, columns], tangents(now)[rows, columns])
+        values = ((now - rest)[rows, columns], strain.stretch, strain.direction, strain.area)
+        for name, value in zip(found, values, strict=True):
+            found[name].append(value)
+    return {name: np.stack(values).astype(np.float32) for name, values in found.items()}
 
 
 def _disturbed(
@@ -278,6 +314,7 @@ def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye],
 def _meta(cfg: PhantomConfig) -> SequenceMeta:
     """What `sequence.json` says."""
     kinds = f", instruments {cfg.instruments}, tissue {cfg.tissue}" if cfg.has_kinds else ""
+    kinds += f", mechanics {cfg.mechanics}" if cfg.mechanics != "none" else ""
     kinds += f", scene {cfg.scene}" if cfg.scene != "cavity" else ""
     made = f"synthetic (endoprior phantom, seed {cfg.seed}{kinds})"
     return SequenceMeta(

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit, prange
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 from .instrument_shapes import cylinder
 from .shading import HIGHLIGHT_LIMIT, REFERENCE_MM, ggx
 
@@ -159,7 +160,7 @@ def _paint(n, norm, p, part, g):
     return grain
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def draw_graspers(tools, materials, tissue_z, camera, lights, focal, cx, cy, color, depth):
     # A task takes every 64th row, since tools fill only some rows. Sphere-traces each tool in front of the tissue
     # tissue_z (SH, SW), mm; writes color (SH, SW, 3) and depth (SH, SW), only where a tool is nearest.

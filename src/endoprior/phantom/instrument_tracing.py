@@ -11,6 +11,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 from .camera import STILL, Eye
 from .graspers import draw_graspers
 from .instrument_light import Material, paint_at, radiance_at
@@ -143,7 +144,7 @@ def _gradient(p, g, parts, n):
         n[0], n[1], n[2] = n[0] + d * ex, n[1] + d * ey, n[2] + d * ez
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _draw(tools, parts, materials, tissue_z, mirror, camera, lights, focal, cx, cy, color, depth):
     # A task takes every 64th row. Sphere-traces each tool (T, 31) in front of the tissue tissue_z (SH, SW), mm; writes
     # color (SH, SW, 3) and depth (SH, SW), only where a tool is nearest.

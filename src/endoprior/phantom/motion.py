@@ -1,7 +1,7 @@
 """Motion of tissue and instruments: breathing, sliding, pulls by the grasper, paths of the instrument tips.
 
-Every motion is a product of smooth functions of place and time (quintic steps, cosines, Gaussians), so that velocities
-are continuous. `phase` is time as a fraction of the sequence, in [0, 1].
+Every motion is a product of smooth functions of place and time (quintic steps, cosines, Gaussians; of place, the
+equilibria of `mechanics`), so that velocities are continuous. `phase` is time as a fraction of the sequence, in [0, 1].
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import NARROW_PULL_MM, PhantomConfig
+from .mechanics import GROWTH_PER_MM, Load, solve_sheet
 from .surface import Anatomy, Plane, organs_at
 
 _BREATH_FRAMES = 40
@@ -27,6 +28,11 @@ def smooth_step(low: float, high: float, x: float) -> float:
     """0 below `low`, 1 above `high`, a quintic with continuous second derivative between."""
     t = min(max((x - low) / (high - low), 0.0), 1.0)
     return t * t * t * (t * (t * 6 - 15) + 10)
+
+
+def _breath(phase: float, frames: int) -> float:
+    """How far the cycle of breathing is, rad."""
+    return 2 * np.pi * phase * (frames - 1) / _BREATH_FRAMES
 
 
 @dataclass(frozen=True)
@@ -87,10 +93,18 @@ class Motion:
     """(6,) second tool: center (a, b, height), sweep (a, b) in mm, time shift in rad."""
     side: float
     """+1: the grasper enters from the right, -1: from the left."""
+    loads: tuple[Load, ...] = ()
+    """Move the tissue by a law of mechanics, in place of the closed forms."""
+    pokes: bool = False
+    """Whether the jaws stay closed."""
 
     def displacement(self, a: NDArray, b: NDArray, phase: float) -> NDArray[np.float64]:
         """(..., 3) motion away from rest along e_a, e_b and the normal, mm, at plane points `a, b`."""
-        cycle = 2 * np.pi * phase * (self.frames - 1) / _BREATH_FRAMES
+        if self.loads:
+            strengths = [load.strength(phase) for load in self.loads]
+            carried = [load.sheet.displacement(a, b, s) for load, s in zip(self.loads, strengths, strict=True) if s > 0]
+            return np.sum([np.zeros((*np.shape(a), 3)), *carried], 0)
+        cycle = _breath(phase, self.frames)
         # The tissue swells and slides; distant parts lag slightly and move slightly less.
         lag = 0.006 * a - 0.009 * b
         swell = 0.5 * self.breathing_mm * (np.sin(cycle - lag) + 0.18 * np.sin(2 * (cycle - lag) + 0.7))
@@ -123,6 +137,7 @@ class Motion:
         near = 1 - smooth_step(0.72, 1.0, local) if leaving else smooth_step(0.0, 0.19, local)
         tip = idle + near * (held - idle)
         closed = smooth_step(0.15, 0.23, local) * (1 - smooth_step(0.66, 0.74, local))
+        closed = 1.0 if self.pokes else closed
         grasper = ToolPose(np.array([self.side * 66.0, 50.0, 12.0]), tip, 0.05 + 0.60 * (1 - closed), 0.15 * near)
         a, b, height, sweep_a, sweep_b, shift = self.hover
         swing = 2 * np.pi * phase * max(1.0, self.frames / 64) + shift
@@ -149,13 +164,35 @@ def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> Motion:
         idle = np.clip(center + np.array([side * rng.uniform(2, 10), rng.uniform(3, 9)]), [-11, -10], [11, 6])
         idles.append([*idle, rng.uniform(25, 30)])
         if k < cycles:
-            away = np.array([side * rng.uniform(0.3, 0.75), rng.uniform(-0.35, 0.35), rng.uniform(0.65, 0.9)])
+            away = _away(cfg, side, rng.uniform(0.3, 0.75), rng.uniform(-0.35, 0.35), rng.uniform(0.65, 0.9))
             height = float(organs_at(anatomy, *center.reshape(2, 1, 1)).height[0, 0])
-            vector, width = cfg.pull_mm * away / np.linalg.norm(away), max(1.0, cfg.pull_mm / NARROW_PULL_MM)
+            vector, width = cfg.pull_mm * away, max(1.0, cfg.pull_mm / NARROW_PULL_MM)
             pulls.append(Pull(center, height, vector, k / cycles, 1 / cycles, width))
     hover = [-side * rng.uniform(17, 24), rng.uniform(8, 14), rng.uniform(21, 25)]
     hover += [rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(0, 6.3)]
     if cfg.instruments != "graspers":
         hover[0], hover[2] = _NEARER * hover[0], hover[2] + _HIGHER_MM  # thin tools would hardly be in the image
     motion = cfg.breathing_mm, cfg.slide_mm, tuple(pulls), np.array(idles), np.array(hover), side
-    return Motion(plane, anatomy, cfg.frames, *motion)
+    loads = _loads(cfg, anatomy, pulls)
+    return Motion(plane, anatomy, cfg.frames, *motion, loads, pokes=cfg.mechanics == "poke")
+
+
+def _away(cfg: PhantomConfig, side: float, less: float, along: float, more: float) -> NDArray[np.float64]:
+    """(3,) unit direction of a pull, from shares: mostly off the tissue, by mechanics as much along it, so
+    that it stretches; a poke goes into it; 0 where the tool only touches.
+    """
+    if cfg.mechanics in ("poke", "breathe"):
+        return np.array([0.0, 0.0, -1.0 if cfg.mechanics == "poke" else 0.0])
+    away = np.array([side * (less if cfg.mechanics == "none" else more), along, more])
+    return away / np.linalg.norm(away)
+
+
+def _loads(cfg: PhantomConfig, anatomy: Anatomy, pulls: list[Pull]) -> tuple[Load, ...]:
+    """What moves the tissue by mechanics."""
+    if cfg.mechanics == "none":
+        return ()
+    if cfg.mechanics == "breathe":
+        rise = cfg.breathing_mm
+        sheet = solve_sheet(anatomy, pulls[0].center, np.zeros(3), rise, rise * GROWTH_PER_MM)
+        return (Load(sheet, lambda phase: float(0.5 - 0.5 * np.cos(_breath(phase, cfg.frames)))),)
+    return tuple(Load(solve_sheet(anatomy, pull.center, pull.vector, 0.0, 0.0), pull.strength) for pull in pulls)

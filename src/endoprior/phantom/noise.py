@@ -11,6 +11,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 
 
 @njit(cache=True, inline="always")
@@ -31,7 +32,7 @@ def _corner(ix, iy, seed, dx, dy):
     return gx * dx + gy * dy
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _fractal(x, y, octaves, seed, out):
     # One task per row of x, y, out (H, W). Gradient noise with a quintic fade; octave k has frequency 2^k, weight 2^-k.
     for i in prange(x.shape[0]):
@@ -53,7 +54,7 @@ def _fractal(x, y, octaves, seed, out):
             out[i, j] = total
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _cells(x, y, seed, out):
     # One task per row. Difference between the distances to the second and the first nearest jittered lattice point.
     for i in prange(x.shape[0]):

@@ -11,6 +11,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 
 _BANDS = 16
 _RIM = np.float32(1e-4)  # triangles are widened by this, so that samples on a shared edge belong to one of the two
@@ -46,7 +47,7 @@ def _fill(corners, indices, box, mesh_w, mesh_h, out):
                 out[py, px, 2] = z
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _rasterize(x, y, inverse_z, row_low, row_high, out):
     # One task per band of image rows; it walks the mesh in a fixed order and keeps the nearest triangle of each sample.
     # x, y, inverse_z (MH, MW) projected vertices, px and 1/mm (0: not to be drawn); row_low/high (MH - 1,) y range of

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ from .scene import Moment, build_scene
 from .sensor import develop, expose, exposure_gain, vignette
 from .views import render_view
 
+RECORDED = Path(__file__).with_name("sample.mp4")
+"""The clip of `SampleConfig()`, written by `write_sample`: drawing it takes a minute."""
 _FOCAL = 0.9
 """Focal length, as a share of the image width."""
 _BASELINE_MM = 4.2, 0.06, -0.04

@@ -12,6 +12,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 from .camera import Eye
 from .raster import FAR
 
@@ -31,7 +32,7 @@ def ggx(cosine, alpha):
     return square / (np.float32(np.pi) * d * d)
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _shade(hits, normals, texture, e_a, e_b, camera, turn, viewer, lights, focal, cx, cy, far, wet, out):
     # One task per row of samples. hits (SH, SW, 3) from `rasterize`; normals (MH, MW, 3); texture (TH, TW, 7); writes
     # out (SH, SW, 3) linear radiance. Both look-ups are bilinear; black where nothing was hit.

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 from .config import PhantomConfig
 from .noise import fractal
 
@@ -179,7 +180,7 @@ def _spline(knots: NDArray, count: int) -> NDArray:
     return np.stack([np.interp(even, arc, curve[:, i]) for i in range(2)], -1)
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _loops(a, b, paths, radii, bases, boxes, height, owner, along, across):
     # One task per row of a, b (H, W). Highest loop at each point; ties go to the lower index. boxes (K, 4) are a0, a1,
     # b0, b1 outside which a loop lies under the floor. Writes the last four arrays.

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ..core.checks import InputError
 from ..data import load_sequence
-from ..data.files import read_json
+from ..evaluation.context import read_scores
 from ..evaluation.registry import all_scores
 from ..prepare.pipeline import Progress
 from ..render import ON_GPU
@@ -173,7 +173,7 @@ def _reason(entry: Entry, error: Exception) -> str:
 def write_summary(outcomes: Sequence[Outcome], out: Path) -> list[str]:
     """Write the table of a batch to `SUMMARY` and `TABLE` in `out`; the lines of `SUMMARY`."""
     done = [outcome.entry for outcome in outcomes if not outcome.failure]
-    scores = {entry.name: read_json(entry.job.run / "metrics.json")["scores"] for entry in done}
+    scores = {entry.name: read_scores(entry.job.run / "metrics.json")["scores"] for entry in done}
     known = [all_scores()[name] for name in SHOWN_SCORES if any(name in found for found in scores.values())]
     lines = []
     if done:

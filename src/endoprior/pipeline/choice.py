@@ -15,11 +15,10 @@ from typing import Any
 
 from ..core.checks import input_error
 from ..core.shell import command, command_of
-from ..data.files import read_json
 from ..footage.components import Image
 from ..prepare.first_pass import source_facts
 from ..prepare.scan import scan_video
-from ..prepare.segments import Stretch, as_json, best_segment, best_start, from_json, segments_of
+from ..prepare.segments import Stretch, as_json, best_segment, best_start, from_json, read_scan, segments_of
 
 SCAN = "scan.json"  # file in the output folder; the timeline lies beside it
 MOST_NAMED = 3  # other segments that are named
@@ -60,7 +59,7 @@ class Choice:
                 lost[each.reason] += each.seconds
         bad = ", ".join(f"{reason} {lost[reason]:.1f} s" for reason in sorted(lost, key=lambda each: -lost[each]))
         if not self.number:
-            return [f"no segment of {video} is clear ({bad}): everything is used"] if bad else []
+            return [f"no segment of {video} is clear ({bad}), so everything is used"] if bad else []
         (start, end), ranked = self.span, sorted(range(len(self.segments)), key=lambda i: -self.segments[i].score)
         is_best = ranked[0] == self.number - 1
         why = "the most time in which tissue is clear and can be followed" if is_best else "as --segment says"
@@ -77,7 +76,7 @@ class Choice:
         ]
 
 
-def choose_segment(video: Path, out: Path, folder_rate: float, wanted: int = 0) -> Choice:
+def choose_segment(video: Path, out: Path, folder_rate: float | None, wanted: int = 0) -> Choice:
     """Scan a video, unless `out` or the folder around it holds its scan; choose the wanted segment, or the best for 0.
 
     Raises:
@@ -85,7 +84,7 @@ def choose_segment(video: Path, out: Path, folder_rate: float, wanted: int = 0) 
     """
     facts = json.dumps(source_facts(video) | {"folder_rate": folder_rate})
     identity = hashlib.sha256(facts.encode()).hexdigest()  # its name may be that of a patient
-    stored = [read_json(folder / SCAN) for folder in (out, out.parent) if (folder / SCAN).is_file()]
+    stored = [read_scan(folder / SCAN) for folder in (out, out.parent) if (folder / SCAN).is_file()]
     scanned, pictures = next((each for each in stored if each.get("video") == identity), None), ()
     if scanned is None:
         scan = scan_video(video, folder_rate)

@@ -16,13 +16,13 @@ from typing_extensions import override
 from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.config_io import to_dict
-from ..core.shell import Options, changed_options
+from ..core.shell import Options, changed_options, command
 from ..data import load_sequence
 from ..data.files import entries, read_json
 from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import input_facts, source_facts
-from ..prepare.source import open_source
+from ..prepare.source import ImageFolder, open_source
 from ..prepare.video_clip import FrameSelection, Moment
 from ..prepare.work_folder import work_lock
 from ..system.atomic import reject_occupied, write_json
@@ -123,6 +123,7 @@ class Job(SequenceJob):
     prepare: PrepareConfig  # options of `prepare`, for `part` only
     part: Part
     choice: Choice | None = None  # the segment that was chosen; None if the user chose the part
+    rate_is_assumed: bool = False  # whether nothing tells the frame rate of a folder of images
 
     @property
     @override
@@ -169,7 +170,8 @@ def make_job(
     options: Options = {"--preview": ()} if preview else {"--preset": (preset,)} if preset != "default" else {}
     options |= {"--seed": (str(cfg.seed),)} if cfg.seed else {}
     options |= {"--segment": (str(segment),)} if segment else {}
-    return Job(video, out, cfg, options | changed_options(prepare), chosen, part, choice)
+    is_assumed = isinstance(source, ImageFolder) and source.rate_is_assumed
+    return Job(video, out, cfg, options | changed_options(prepare), chosen, part, choice, is_assumed)
 
 
 def open_folder(job: SequenceJob) -> bool:
@@ -187,7 +189,9 @@ def open_folder(job: SequenceJob) -> bool:
         write_json(file, given)
         _keep_scan(job)
         return False
-    if not (found := differences(read_json(file), given)):
+    show = f"; what is in this one: `{command('view', job.run)}`" * (job.run / "scene.safetensors").is_file()
+    stored = read_json(file, f"pass another folder for the results{show}.")
+    if not (found := differences(stored, given)):
         return True
     if any(path.exists() for path in (job.findings, job.run, job.out / DATA)):
         got = "; ".join(found[:MOST_NAMED]) + (f"; and {len(found) - MOST_NAMED} more" if found[MOST_NAMED:] else "")

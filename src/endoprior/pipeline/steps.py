@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..check import draw_check, find, measure
-from ..check.report import as_json
-from ..core.checks import input_error, quotation
+from ..check import Finding, draw_check, find, measure
+from ..check.report import as_json, read_findings
+from ..core.checks import InputError, input_error, quotation
 from ..core.config import Config
-from ..core.shell import command, command_of
+from ..core.config_io import from_dict
+from ..core.shell import command, command_of, quoted
 from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
 from ..data.description import MOTION, read_description
@@ -27,12 +28,13 @@ from ..data.pixels import measured_share
 from ..evaluation.context import RenderedFrame, RenderedFrames, SceneFrames
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
-from ..evaluation.verdict import WORDS, Facts, Verdict, verdict_on
+from ..evaluation.verdict import Facts, Verdict, verdict_on
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
 from ..footage.components import runs
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
+from ..prepare.notes import note_line
 from ..prepare.pipeline import Progress
 from ..prepare.scan_figure import draw_scan
 from ..runs.folder import CHECKPOINT, CONFIG
@@ -89,7 +91,8 @@ def notes_of(step: Step, job: SequenceJob) -> list[str]:
 
 
 def _stored_notes(job: SequenceJob) -> dict[str, Any]:
-    return read_json(job.notes) if job.notes.is_file() else {}
+    fix = "remove it, and repeat the command: only the notes of steps that are done are lost."
+    return read_json(job.notes, fix) if job.notes.is_file() else {}
 
 
 def _prepare(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
@@ -98,7 +101,7 @@ def _prepare(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[
     if job.choice:
         choice, figure = job.choice, (job.out / SCAN).with_suffix(".png")
         draw_scan(job.source, choice.scanned, figure, job.prepare.folder_rate, choice.pictures)
-    return [f"{done.num_frames} frames of {done.size[0]}x{done.size[1]}", *(f"note: {note}" for note in done.notes)]
+    return [f"{done.num_frames} frames of {done.size[0]}x{done.size[1]}", *map(note_line, done.notes)]
 
 
 def _check(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
@@ -112,13 +115,17 @@ def _check(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     return [str(finding) for finding in shown]
 
 
+def _findings(job: SequenceJob) -> tuple[Finding, ...]:
+    return read_findings(job.findings, "remove it, and repeat the command: the sequence is checked again.")
+
+
 def problems(job: SequenceJob) -> str:
     """Which errors and warnings `check` found, and the command that prints their fixes; empty without any.
 
     What the file says is not repeated: it may come from somebody else.
     """
-    found = [finding for finding in read_json(job.findings)["findings"] if finding["severity"] != "note"]
-    codes = dict.fromkeys(code for finding in found if CODE.fullmatch(code := finding["code"]))
+    found = [finding for finding in _findings(job) if finding.severity != "note"]
+    codes = dict.fromkeys(finding.code for finding in found if CODE.fullmatch(finding.code))
     paint = f"To paint tools: `{command('view', job.data)}`. " if "tool-fraction" in codes else ""
     fix = f"{paint}How to fix it: `{command('check', job.data)}`"
     return f"Found by check: {', '.join(codes)}. {fix}" if codes else ""
@@ -132,8 +139,7 @@ def start_training(
     cfg, notes, usable = job.cfg, list[str](), (0, len(sequence))
     if isinstance(job, Job):
         unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
-        findings = read_json(job.findings)["findings"]
-        cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
+        cuts = [frame for finding in _findings(job) if finding.code == "scene-cut" for frame in finding.frames]
         demand_known_motion(job, sequence, unexplained)
         usable = usable_frames(len(sequence), unexplained, cuts)
     first, end = usable
@@ -142,7 +148,7 @@ def start_training(
         cfg = replace(cfg, data=replace(cfg.data, first_frames=end, skip_frames=skipped))
         sequence = load_sequence(job.data, cfg.data)
         why = "the camera is lost, or the scene changes, before and after"
-        notes = [f"note: training uses frames {first}-{end - 1}, the longest stretch: {why}"]
+        notes = [f"training uses frames {first}-{end - 1}, the longest stretch: {why}"]
     begun = (job.run / CHECKPOINT).is_file() or (job.run / CONFIG).is_file()
     return start_run(sequence, cfg, job.run, resume=begun, say=lambda _text: None), notes
 
@@ -183,6 +189,7 @@ def _of_gaussians(scene: RenderedScene) -> Scene:
 
 
 def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
+    codes = tuple(finding.code for finding in _findings(job))
     progress("rendering held-out frames", 0, 0)
     scene = _of_gaussians(load_scene(job.run))
     sequence = _frames_of(job, scene.config)
@@ -192,10 +199,10 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
     is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
-    codes = tuple(finding["code"] for finding in read_json(job.findings)["findings"])
     facts = Facts(
         share_used=1 - len(left_out) / count,
         share_with_missed_tools=len(missed) / count,
+        lengths_are_relative=sequence.depth_is_relative,
         depth_is_guessed=sequence.depth_is_guessed,
         depth_measured=measured_share(sequence.frames("test")),
         motion_is_unknown=is_unknown,
@@ -203,7 +210,8 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     )
     result.verdict = verdict_on(result.scores, facts)
     result.save(job.run)
-    title = [PREVIEW_TITLE] * job.is_preview + wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)
+    title = [f"{result.verdict.plain}.", *wrap(f"Verdict: {result.verdict}", TITLE_LETTERS)]
+    title += [PREVIEW_TITLE] * job.is_preview
     write_report(scene, sequence, job.run, job.report, "\n".join(title))
     known = [all_scores()[name] for name in SHOWN_SCORES if name in result.scores]
     shown = [f"{score.label} {score.text(result.scores[score.name], sequence.depth_is_relative)}" for score in known]
@@ -211,12 +219,15 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
 
 
 def verdict_of(job: SequenceJob) -> Verdict | None:
-    """The verdict on the model of a job; None of one that an earlier version made."""
+    """The verdict on the model of a job; None of one that another version made."""
     file = job.run / "metrics.json"
-    stored = read_json(file).get("verdict") if file.is_file() else None
-    if not isinstance(stored, dict) or stored.get("word") not in WORDS:
+    fix = f"remove it and {quoted(job.report)}, and repeat the command: the model is scored again."
+    stored = read_json(file, fix).get("verdict") if file.is_file() else None
+    try:
+        verdict = from_dict(Verdict, stored)
+    except InputError:
         return None
-    return Verdict(stored["word"], tuple(quotation(str(reason)) for reason in stored.get("reasons", [])))
+    return replace(verdict, reasons=tuple(map(quotation, verdict.reasons)), plain=quotation(verdict.plain))
 
 
 def _render_video(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[str]:
@@ -264,7 +275,7 @@ def _player(job: SequenceJob, progress: Progress, _handed_on: HandedOn) -> list[
     times = shown(PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video
     verdict = verdict_of(job)
-    remark = f"Verdict: {verdict}" if verdict else ""
+    remark = " ".join([f"{verdict.plain}."] * bool(verdict.plain) + [f"Verdict: {verdict}"]) if verdict else ""
     while not job.player.exists():
         try:
             write_html(scene, job.player, title=title, remark=remark, times=times, max_bytes=PLAYER_BYTES)

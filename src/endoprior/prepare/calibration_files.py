@@ -50,7 +50,7 @@ BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # single coefficients,
 FISHEYE = ("k1", "k2", "k3", "k4")
 MODEL_NAMES = ("distortionmodel", "distortiontype", "projection")  # of the distortion: every value must be known
 # These may also hold the product's name: only known models count.
-LENS_NAMES = ("model", "type", "cameramodel", "cameratype", "lensmodel", "lenstype", "camera", "lens")
+LENS_NAMES = ("model", "type", "cameramodel", "cameratype", "modeltype", "lensmodel", "lenstype", "camera", "lens")
 FLAGS = ("fisheye", "isfisheye", "fisheyemodel", "usefisheye")
 USUAL = (
     "", "none", "plumbbob", "radtan", "radialtangential", "rationalpolynomial", "rational", "brown", "brownconrady",
@@ -134,6 +134,7 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     left_side, right_side = next((pair for pair in (*sides, *single) if pair[0].has_camera), (table.part("left"), None))
     right_side = right_side if right_side and right_side.has_camera else None
     if not left_side.has_camera:
+        _is_fisheye(table)  # a model that is not known is the better reason
         raise table.error("the left camera matrix", f"only {', '.join(list(table)[:6])}")
     left, is_stated = _camera(left_side, table, "left" if right_side else "only")
     right = rotation = translation = None
@@ -154,6 +155,11 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
 
 def _camera(local: _Values, table: _Values, which: str) -> tuple[Intrinsics, bool]:
     """One camera of its own values, and of those for both, such as the lens model; and whether a lens is stated."""
+    # Words and flags of the whole file describe both lenses; numbers do not. Which model it is comes before the matrix:
+    # those that are not read have other numbers.
+    whole = table.part("camera") | table
+    shared = {n: v for n, v in whole.items() if isinstance(v, str | bool) or "fisheye" in n}
+    distortion, fisheye, is_stated = _lens(_Values(shared | local, local.path))
     if name := local.matrix:
         shape = (4,) if np.size(local[name]) == 4 else (3, 3)
         matrix = local.array(name, shape, f" of the {which} camera")
@@ -165,10 +171,6 @@ def _camera(local: _Values, table: _Values, which: str) -> tuple[Intrinsics, boo
             raise local.error(want, f"no {missing[0]}", "Complete it.")
         fx, fy, cx, cy = map(local.number, (FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    # Words and flags of the whole file describe both lenses; numbers do not.
-    whole = table.part("camera") | table
-    shared = {n: v for n, v in whole.items() if isinstance(v, str | bool) or "fisheye" in n}
-    distortion, fisheye, is_stated = _lens(_Values(shared | local, local.path))
     plausible = np.abs(matrix).max() < MOST_PX and np.abs(distortion).max(initial=0) < MOST_PX
     if not (plausible and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
         raise local.error("a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")

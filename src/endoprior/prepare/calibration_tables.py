@@ -31,7 +31,7 @@ FOREIGN = {
     b"\x80": ("a pickle, which could run programs", "Save it with numpy.savez, or as .json."),
     b"\xd0\xcf\x11\xe0": ("a document of an office program", "Export it as text."),
 }  # first bytes of formats that are not read: what they are, and what to do
-COLMAP_LINE = re.compile(r"\d+\s+([A-Z_]{3,})\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
+COLMAP_LINE = re.compile(r"\d+\s+[A-Z_]{3,}\s+\d+\s+\d+(?:\s+\S+)+")
 INI_SECTION = re.compile(r"^\s*\[[A-Za-z][^\]=:]*\]\s*$", re.MULTILINE)
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 ONLY_NUMBERS = re.compile(rf"[\s,;\[\]()]*(?:{NUMBER.pattern}[\s,;\[\]()]+)*")
@@ -149,7 +149,7 @@ def _of_colmap(path: Path) -> Table:
     if len(names) != len(camera.values):
         raise input_error(path, f"{len(names)} numbers of {camera.model}", str(len(camera.values)), "Write it again.")
     found = dict(zip(names, camera.values, strict=True))
-    found |= {"fx": found["f"]} if "f" in found else {}
+    found |= {"fx": found["f"], "fy": found["f"]} if "f" in found else {}
     facts = {"camera_model": camera.model, "pixel_center": 0.5, "width": camera.width, "height": camera.height}
     return facts | found
 

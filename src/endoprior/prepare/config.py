@@ -73,8 +73,8 @@ class PrepareConfig:
     """End time, seconds; not included. inf is the end of the video."""
     frames_per_second: float = 0.0
     """Frame rate of the output; 0 is the usual rate of the source."""
-    folder_rate: float = 25.0
-    """Frame rate of a folder of images, 1/s."""
+    folder_rate: float | None = None
+    """Frame rate of a folder of images, 1/s; without it that of its sequence.json, else 25."""
     max_frames: int = 10_000
     """Stop with an error above this number of frames; choose a part of the video or a lower rate."""
     drop_out_of_body: bool = False
@@ -83,9 +83,9 @@ class PrepareConfig:
     crop: str | None = None
     """x,y,width,height in px of one camera's image: keep only this part."""
     blank: tuple[str, ...] = ()
-    """x,y,width,height rectangles to paint black and mask, such as burned-in patient names."""
+    """x,y,width,height rectangles to paint black and mask, such as patient names that are not found."""
     border: Literal["auto", "keep"] = "auto"
-    """`auto`: crop console strips and black bars, mask the outside of a round border, blank burned-in labels."""
+    """`auto`: crop console strips and black bars, mask the outside of a round border, burnt-in text and drawings."""
     max_width: int = 640
     """Resize wider images to this width, px; 0 keeps the size."""
 
@@ -108,7 +108,7 @@ class PrepareConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
     masks: str = "auto"
-    """`auto` (found in the frames), `sam2`, `none`, or a folder of masks."""
+    """`auto` (given beside the images, else found), `sam2`, `none`, or a folder of masks."""
     mask_labels: str = ""
     """Labels in the mask folder that are tools: names such as `shaft,jaw`, values such as `1,3`. Usually they tell."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
@@ -122,7 +122,7 @@ class PrepareConfig:
     """Meaning of the matrices in the file of --poses: camera-to-world with OpenCV or OpenGL axes, or LLFF's columns
     (down, right, back); or world-to-camera. `check` tells which one fits."""
     poses_unit_mm: float = 1.0
-    """mm per unit of the positions in the file of --poses: 1000 for m."""
+    """mm per unit of the positions in the file of --poses: 1000 for m, which text has without this."""
     stir: Path | None = None
     """Folder of the STIR clip (`left/seqNN`) that VIDEO belongs to: its tattooed points become `truth/tracks.npz`."""
     keep_right: bool = False
@@ -144,10 +144,12 @@ class PrepareConfig:
             raise ValueError("stir needs depth, got --depth none")
         for name, low, high in (
             ("field_of_view_degrees", 10, 170), ("start", 0, 1e9), ("frames_per_second", 0, 1000),
-            ("folder_rate", 0.01, 1000), ("max_frames", 2, 1_000_000), ("max_width", 0, 16384),
+            ("max_frames", 2, 1_000_000), ("max_width", 0, 16384),
             ("depth_unit_mm", 0, 1e6), ("poses_unit_mm", 1e-6, 1e6), ("working_distance_mm", 1, 1000),
             ("shaft_mm", 0, 1000),
         ):  # fmt: skip
             check_range(name, getattr(self, name), low, high)
+        if self.folder_rate is not None:
+            check_range("folder_rate", self.folder_rate, 0.01, 1000)
         if not self.end > self.start:
             raise ValueError(f"end must be after start, got {self.end:g} and {self.start:g}")

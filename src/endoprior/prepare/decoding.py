@@ -6,14 +6,15 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import chain, islice, tee, zip_longest
-from typing import TypeVar
+from itertools import groupby, islice, pairwise, tee, zip_longest
+from typing import TypeVar, cast
 
 import av
 import numpy as np
 from av.container import InputContainer
 from av.error import BlockingIOError, EOFError, FFmpegError
 from av.filter import Graph
+from av.sidedata.sidedata import SideDataContainer
 from av.video.stream import VideoStream
 
 AVI = "avi"  # FFmpeg's name of the format that counts time in images and does not hold when they are shown
@@ -21,6 +22,8 @@ DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800  # FFmpeg's bits
 SHORT = 0.5  # a track that lasts a smaller share of the longest one is a preview
 RATES = (0.01, 100_000.0)  # plausible frame rates, 1/s
 USUAL_RATE = 25.0  # frame rate of a file without times, 1/s
+MOST_HELD = 16  # decoded images that are held in memory to spread them over time
+MATRIX_BYTES = 36  # of FFmpeg's display matrix, 3x3 integers of 32 bits
 NEAR = 0.25  # time steps that differ from the median by less than this share are the usual step
 SAME_RATE = 0.01  # a stated rate that differs from the measured one by less than this share is its exact value
 Item = TypeVar("Item")
@@ -34,7 +37,7 @@ class DecodedImage:
     seconds: float | None  # time in the file; None if it has no times
     damaged: bool  # bytes of it, or of an image that it was predicted from, are missing or wrong
     interlaced: bool  # whether the file says that its even and odd rows were taken at different times
-    turns: int  # quarter turns, counterclockwise, that bring it upright
+    orientation: int  # of the stored pixels, as in EXIF: 1 as they are shown, 2 to 8 mirrored or turned
 
 
 @dataclass
@@ -43,39 +46,65 @@ class Timeline:
 
     step: float  # usual time between two images, s
     restarts: int = 0  # how often time starts again, as where two recordings were joined
-    misplaced: int = 0  # images whose time is not after that of the image before, while the next one is in order again
+    misplaced: int = 0  # images whose time is before that of the image before, while the next one is in order again
+    repeated: int = 0  # images with the time of the image before
 
     def along(self, images: Iterable[tuple[Item, float | None]]) -> Iterator[tuple[Item, float]]:
         """The images, in their order, and their times, s: of the file, None where it has none, and on this line.
 
-        A misplaced image keeps its time; all others are later than those before.
+        Images of one time are spread up to the next time. A misplaced image keeps its time; all others are later than
+        those before.
         """
-        shift, last = 0.0, None
-        images, ahead = tee(images)
-        for (image, time), after in zip(images, chain(islice(ahead, 1, None), [None]), strict=False):
-            following = after and after[1]
+        shift, last, before = 0.0, None, None
+        for items, time, following in _of_one_time(images):
             now = (0.0 if last is None else last + self.step) if time is None else time + shift
-            if time is not None and last is not None and now <= last:
+            is_repeated = time is not None and time == before
+            if is_repeated and last is not None:
+                now = last + self.step
+            elif time is not None and last is not None and now <= last:
                 if following is not None and following + shift > last:
-                    self.misplaced += 1
-                    yield image, now
+                    self.misplaced += len(items)
+                    yield from ((item, now) for item in items)
                     continue
-                self.restarts += 1
+                self.restarts += before is None or time < before
                 now = last + self.step
                 shift = now - time
-            yield image, now
-            last = now
+            self.repeated += len(items) - (not is_repeated)
+            room = 0.0 if following is None else (following + shift - now) / len(items)
+            spacing = min(room, self.step) if room > 0 else self.step
+            for place, item in enumerate(items):
+                last = now + place * spacing
+                yield item, last
+            before = time
+
+
+def _of_one_time(
+    images: Iterable[tuple[Item, float | None]],
+) -> Iterator[tuple[list[Item], float | None, float | None]]:
+    """Images in a row with the same time, at most `MOST_HELD` together; that time, and the one after it."""
+    items, time = list[Item](), None
+    for image, seconds in images:
+        if items and (time is None or seconds != time or len(items) == MOST_HELD):
+            yield items, time, seconds
+            items = []
+        items.append(image)
+        time = seconds
+    if items:
+        yield items, time, None
 
 
 def usual_rate(times: Sequence[float], stated: Sequence[float]) -> float:
-    """Frame rate of a video, 1/s: that of most of its time steps. Pauses do not change it.
+    """Frame rate of a video, 1/s: that of most of its time steps. Pauses do not change it, nor do times that repeat.
 
     Args:
         times: of the images in the order of the file, s; they may start again.
         stated: rates that the file states, the best one first; they may be averages over pauses, or a clock.
     """
     usable = [rate for rate in stated if RATES[0] <= rate <= RATES[1]]
-    steps = np.diff(np.asarray(times, np.float64))
+    runs = [(time, len(list(run))) for time, run in groupby(times)]
+    steps = np.repeat(
+        [(after - time) / count for (time, count), (after, _) in pairwise(runs)], [count for _, count in runs[:-1]]
+    )
     steps = steps[steps > 1 / RATES[1]]
     if not len(steps):
         return usable[0] if usable else USUAL_RATE
@@ -201,8 +230,19 @@ def _with_damage(container: InputContainer, track: VideoStream, lost: list) -> I
             incomplete.discard(frame.pts)
             spoiled = own or (spoiled and not frame.key_frame)
             seconds = None if ticks is None else in_seconds(track, ticks)
-            turns = round(getattr(frame, "rotation", 0) / 90) % 4  # some cameras store it as metadata
-            yield DecodedImage(frame, seconds, spoiled, frame.interlaced_frame, turns)
+            yield DecodedImage(frame, seconds, spoiled, frame.interlaced_frame, _orientation(frame))
+
+
+def _orientation(frame: av.VideoFrame) -> int:
+    """That of the display matrix, in EXIF's numbers. It maps a stored pixel (x, y) to (a x + c y, b x + d y)."""
+    every = cast(SideDataContainer, frame.side_data)  # PyAV's stub calls it a dictionary of something else
+    stored = next((bytes(each) for each in every if each.type.name == "DISPLAYMATRIX"), b"")
+    if len(stored) != MATRIX_BYTES:
+        return 1
+    a, b, _, c, d, *_ = np.frombuffer(stored, np.int32).astype(float)
+    if abs(a * d) >= abs(b * c):
+        return {(False, False): 1, (True, False): 2, (True, True): 3, (False, True): 4}[a < 0, d < 0]
+    return {(False, False): 5, (True, False): 6, (True, True): 7, (False, True): 8}[c < 0, b < 0]
 
 
 def _deinterlaced(images: Iterator[DecodedImage]) -> Iterator[DecodedImage]:

@@ -1,9 +1,9 @@
-"""First pass over a clip: count its frames, detect borders and labels, and fix the geometry of all frames."""
+"""First pass over a clip: count its frames, detect borders and text, and fix the geometry of all frames."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,22 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
-from ..core.shell import quoted
 from ..data.reading import kind_of
 from ..footage.border import CERTAIN as SHARP
 from ..footage.border import Circle, Outside, Strips, beyond, find_outline
-from ..footage.changes import are_combed
-from ..footage.overlays import find_static_overlays, find_strokes, without_strokes
+from ..footage.components import grown, square
+from ..footage.overlays import find_strokes, without_strokes
 from ..footage.round_border import CERTAIN
 from ..system.memory import cache_bytes
+from .burnt_in_text import BurntInText, find_text
 from .calibration import fitted
-from .config import Layout, PrepareConfig, Rectangle, parse_rectangle
+from .config import Layout, PrepareConfig, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
+from .notes import ToDo
 from .source import ImageFolder
 from .video_clip import Clip, FrameSelection, StereoFrame
 
-SAMPLES = 24  # number of frames used to detect borders, labels, tools and lighting
-DARK = 40.0  # images whose brightest percent of values is below this are nearly black
+SAMPLES = 24  # number of frames used to detect borders, text, tools and lighting
+DARK, WHITE = 40.0, 230.0
+"""Images whose brightest percent of values is below the first are nearly black; darkest above the second, white."""
 Image, Mask, Depth = NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]
 
 
@@ -64,10 +66,28 @@ class FirstPass:
     hides: bool = False  # whether drawings in single frames are searched
     moving_border: float | None = None  # level of a border that moves: see `footage.outside.beyond`
     frames: list[StereoFrame] | None = None  # all selected frames, in order; None if they do not fit into memory
+    text: BurntInText = field(default_factory=BurntInText)  # what `find_text` found
 
-    def hidden(self, rgb_u8: Image) -> Mask:
-        """(H, W) True where a frame (H, W, 3) shows nothing of the body, and others do: drawings, or a border."""
+    def all_frames(self, clip: Clip) -> Iterable[StereoFrame]:
+        """The selected frames, kept in memory or decoded once more, with burnt-in text painted."""
+        return map(self.text.painted, self.frames or clip.stereo_frames(clip.selection()))
+
+    def find_text(self, clip: Clip) -> None:
+        """Search the clip for burnt-in text, and paint the samples."""
+        self.text = find_text(self.samples, lambda: self.all_frames(clip), self.indices, self.geometry.view)
+        self.samples = [self.text.painted(frame) for frame in self.samples]
+        self.notes += self.text.notes
+
+    def hidden(self, index: int, rgb_u8: Image) -> Mask:
+        """(H, W) True where a frame (H, W, 3) shows nothing of the body, and others do: text, drawings, or a border.
+
+        Args:
+            index: position of the frame in the source.
+        """
         found = find_strokes(rgb_u8) if self.hides else np.zeros(rgb_u8.shape[:2], bool)
+        if index in self.text.boxes:
+            text = self.text.mask(index, self.geometry.source_size[::-1])
+            found |= grown(self.geometry.values(text), square(1))  # the rim of the text is mixed with tissue
         if self.moving_border is not None:
             found |= beyond(rgb_u8, self.moving_border, self.geometry.inside)
         return found
@@ -112,8 +132,10 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     if brightest < DARK:
         words = f"their brightest parts have {brightest:.0f} of 255. Export them brighter"
         video_notes.append(f"the images are nearly black: {words}")
-    if clip.layout != "interlaced" and are_combed(lefts):
-        video_notes.append(_comb_note(clip))
+    darkest = float(np.median([np.percentile(image, 1) for image in lefts]))
+    if darkest > WHITE:
+        words = f"their darkest parts have {darkest:.0f} of 255. Export them darker, or choose another part"
+        video_notes.append(f"the images are nearly white: {words}")
     calibration, name, notes = clip.calibration, str(cfg.calibration), list[str]()
     across, down = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
     if calibration is not None:
@@ -121,27 +143,26 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
         calibration, words = fitted(calibration, full, name, squeezed=cfg.squeezed_eyes)
         notes += [*calibration.notes, *words]
     strips = circle = outside = other = None
-    labels: list[Rectangle] = []
     if cfg.border == "auto":
         outline = find_outline(without_strokes(lefts))
         circle, strips, outside, other = outline.circle, outline.strips or None, outline.outside, outline.other
-        labels = find_static_overlays([_without(image, strips) for image in lefts])
     blank = [parse_rectangle(text, "--blank") for text in cfg.blank]
     for rectangle in blank:
         demand_within(rectangle, size, "--blank")
     geometry = make_geometry(
         size, calibration, stereo=clip.stereo, name=name, stretch=(across, down),
         field_of_view_degrees=cfg.field_of_view_degrees, max_width=cfg.max_width,
-        crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None, blank=[*labels, *blank],
+        crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None, blank=blank,
         strips=strips, circle=circle, outside=outside,
     )  # fmt: skip
-    notes += border_notes(strips, circle, labels, float(1 - geometry.inside.mean()), other)
+    notes += border_notes(strips, circle, float(1 - geometry.inside.mean()), other)
     if cfg.border == "auto" and (drawn := np.mean([find_strokes(image).any() for image in lefts])):
         notes.append(f"boxes or text are drawn into {drawn:.0%} of the samples: masked in each frame, as no tissue")
     if calibration is None:
+        assumed = f"a field of view of {cfg.field_of_view_degrees:g} degrees is assumed"
+        focal = f"f = {geometry.matrix[0, 0]:.0f} px"
         notes.append(
-            f"no calibration; a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
-            f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
+            ToDo(f"no calibration; {assumed} ({focal}). To change it: --calibration or --field-of-view-degrees.")
         )
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
     level = other.level if other and other.moves else None
@@ -188,16 +209,6 @@ def _stretch(layout: Layout) -> tuple[int, int]:
     return (2, 1) if layout == "side-by-side" else (1, 2)
 
 
-def _without(image: Image, strips: Strips | None) -> Image:
-    """The image with its strips painted black, so that their text is not detected again."""
-    if not strips:
-        return image
-    clean, (height, width) = np.zeros_like(image), image.shape[:2]
-    part = slice(strips.top, height - strips.bottom), slice(strips.left, width - strips.right)
-    clean[part] = image[part]
-    return clean
-
-
 def _timing_notes(selection: FrameSelection, cfg: PrepareConfig) -> list[str]:
     notes, uneven = [], selection.uneven_steps
     if uneven > max(2, 0.02 * selection.taken):
@@ -212,20 +223,10 @@ def _timing_notes(selection: FrameSelection, cfg: PrepareConfig) -> list[str]:
     return notes
 
 
-def _comb_note(clip: Clip) -> str:
-    """That images of a progressive video have rows of two times, and the command that helps."""
-    path, fix = clip.source.path, "deinterlace the video before its images are exported"
-    if not isinstance(clip.source, ImageFolder):
-        even = path.with_name(f"{path.stem}_progressive.mp4")
-        words = ["ffmpeg", "-i", path, "-vf", "bwdif=deint=all", "-crf", "10", even]
-        fix = f"`{' '.join(map(quoted, words))}`"
-    return f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"
-
-
 def border_notes(
-    strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float, other: Outside | None = None
+    strips: Strips | None, circle: Circle | None, outside: float, other: Outside | None = None
 ) -> list[str]:
-    """Notes on detected borders and labels. Args: outside: share of the pixels of a frame that show nothing."""
+    """Notes on detected borders. Args: outside: share of the pixels of a frame that show nothing."""
     notes = []
     if strips:
         sides = ", ".join(f"{n} px {side}" for side, n in vars(strips).items() if n)
@@ -236,21 +237,18 @@ def border_notes(
             f"outside and its rim of {circle.margin_px:.0f} px are masked, {outside:.1%} of a frame."
         )
         if circle.agreement < CERTAIN:
-            notes.append(
-                f"the round border is uncertain: {circle.agreement:.0%} of it agree with the images. If it is wrong, "
-                "use --border keep, with --crop and --field-of-view-degrees."
-            )
+            agree = f"{circle.agreement:.0%} of it agree with the images"
+            fix = "use --border keep, with --crop and --field-of-view-degrees"
+            notes.append(ToDo(f"the round border is uncertain: {agree}. If it is wrong, {fix}."))
     if other and other.mask.any():
         moving = ", and it moves: what it hides is masked in each frame" if other.moves else ""
         notes.append(f"the image has a border: {other.mask.mean():.1%} of the source is outside and masked{moving}.")
         if other.images > 1:
-            notes.append(f"a frame shows {other.images} images; the largest is used. To use another one: --crop.")
+            what = f"a frame shows {other.images} images; the largest is used"
+            notes.append(ToDo(f"{what}. To use another one: --crop."))
         if other.sharpness < SHARP:
-            notes.append(
-                f"the border is uncertain: {other.sharpness:.0%} of its outline is sharp. See check.png; if it is "
-                "wrong, use --border keep, with --crop."
-            )
-    notes += [f"a burned-in label was painted over: {x},{y},{w},{h}" for x, y, w, h in labels]
+            what = f"the border is uncertain: {other.sharpness:.0%} of its outline is sharp"
+            notes.append(ToDo(f"{what}. See check.png; if it is wrong, use --border keep, with --crop."))
     return notes
 
 

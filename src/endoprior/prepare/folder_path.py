@@ -86,7 +86,7 @@ def write_folder_path(
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
-        reading=replace(reading, image_names=names),
+        reading=replace(reading, image_times=_times(described, count), image_names=names),
         progress=lambda done: progress(done, count),
     )
     lost = path.lost if path else list[int]()
@@ -119,6 +119,12 @@ def of_all_images(folder: Path, names: list[str]) -> list[Path]:
     files = list_files(folder, (".png",), "EndoNeRF")
     matched = match_names(folder, [file.name for file in files], range(len(names)), names)
     return [files[position] for position in matched.files.values()]
+
+
+def _times(described: dict[str, Any], count: int) -> list[float]:
+    """Of each frame, s; empty where `sequence.json` has no frame rate."""
+    rate = described.get("frames_per_second")
+    return [i / rate for i in range(count)] if rate else []
 
 
 def _focal(folder: Path, described: dict[str, Any], images: list[Path]) -> float:

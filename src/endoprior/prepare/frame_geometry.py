@@ -43,6 +43,7 @@ class FrameGeometry:
     turn: NDArray  # (3, 3) rotation from the axes of the source's left camera to those of the frames
     baseline_mm: float | None  # None if monocular
     blank: Mask  # (h, w) of the source: True where images are painted black
+    view: Mask  # (h, w) of the source: True on what frames keep and is not masked in all of them
     inside: Mask  # (H, W) of a frame: True inside the endoscope's field of view
 
     def image(self, rgb_u8: NDArray, right: bool = False) -> NDArray:
@@ -114,7 +115,9 @@ def make_geometry(
     inside = _shrink(_cut(warped(keep & ~painted).astype(np.float32), cut), frame) > 0.999
     scale = np.diag([frame[0] / cut[2], frame[1] / cut[3], 1.0])
     shift = np.array([[1, 0, -cut[0]], [0, 1, -cut[1]], [0, 0, 1.0]])
-    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, turn, baseline, painted, inside)
+    return FrameGeometry(
+        size, maps, cut, frame, scale @ shift @ matrix, turn, baseline, painted, keep & ~painted, inside
+    )
 
 
 def _kept(size: Size, crop: Rectangle | None, strips: Strips | None, circle: Circle | None) -> Mask:

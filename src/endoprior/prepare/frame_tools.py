@@ -18,6 +18,7 @@ from ..system.atomic import whole_file
 from ..system.parallel import frame_threads
 from .config import PrepareConfig, is_sam2
 from .first_pass import FirstPass, Image, Mask, MeasuredFrame
+from .notes import ToDo
 
 BYTES_PER_PIXEL = 200  # of the source: memory that a thread needs to measure a frame, bytes
 COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete
@@ -81,9 +82,10 @@ def choose_tools(
 
     share = float(masks.any((1, 2)).mean())
     source = found_source(share)
-    hint = HINT if share else "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
-    notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
-    return tools, source, notes
+    # Where there are none, `check` warns. SAM 2's own masks replace these.
+    none = f"masks: {source}. Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
+    note = ToDo(f"masks: {source}. {HINT}") if share else none
+    return tools, source, [] if is_sam2(cfg.masks) else [note]
 
 
 def _searched(every: Iterable[Image], inside: Mask, file: Path) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

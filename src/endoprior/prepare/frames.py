@@ -6,7 +6,7 @@ Tools are found in the frames, read from the user's files, or followed by a vide
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, islice, repeat
 from pathlib import Path
@@ -32,6 +32,7 @@ from .config import NETWORK, PrepareConfig
 from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
 from .frame_tools import BYTES_PER_PIXEL, HINT, Tools, choose_tools
+from .notes import ToDo
 from .relative_depth import RelativeScale, fit_shading
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
@@ -55,7 +56,7 @@ class FrameMethods:
     measure: Measure | None  # depth that needs no mask: stereo, files, a network
     shade: Callable[[Image, Mask], Depth] | None  # depth from the shading of an image inside a mask
     tools: Tools
-    hidden: Callable[[Image], Mask]  # where a frame shows nothing of the body: drawings, a border that moves
+    hidden: Callable[[int, Image], Mask]  # where a frame shows nothing of the body: see `FirstPass.hidden`
     filter_in_time: bool  # whether to filter depth over neighboring frames
     wanted: Callable[[Image], bool]  # whether an image (H, W, 3) belongs in the sequence
     sources: dict[str, str]  # where images, depth and masks come from
@@ -82,34 +83,27 @@ def choose_methods(
         want = "relative depth after `motion:`, such as motion:shading"
         raise input_error("--depth", want, cfg.depth, "Use `--depth motion`.")
     measure, source, depth_notes = _measured_depth(kind, cfg, first_pass)
-    every = _counted(all_frames(clip, first_pass), geometry, len(first_pass.indices), progress)
+    every = _counted(first_pass.all_frames(clip), geometry, len(first_pass.indices), progress)
     tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples, every, folder)
     notes += depth_notes + mask_notes
     shade = None
     if relative:
         images, usable = (
             [f.rgb_u8 for f in samples],
-            [geometry.inside & ~tools(f.index).mask & ~first_pass.hidden(f.rgb_u8) for f in samples],
+            [geometry.inside & ~tools(f.index).mask & ~first_pass.hidden(f.index, f.rgb_u8) for f in samples],
         )
         if measure is None:
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
         else:
             measure = _scaled(measure, samples, usable, cfg)
         if not (cfg.known_length or cfg.shaft_mm):
-            notes.append(
-                f"depth is relative ({source}), with its median set to {cfg.working_distance_mm:g}: lengths have no "
-                "unit (rel.). For mm use --known-length, a stereo video or measured depth."
-            )
+            what = f"depth is relative ({source}), without a unit; its median is set to {cfg.working_distance_mm:g}"
+            notes.append(ToDo(f"{what}. For mm use --known-length, a stereo video or measured depth"))
     elif kind == "folder" and measure is not None:
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.guess)
     wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
     return FrameMethods(measure, shade, tools, first_pass.hidden, kind == "sgbm", wanted, sources, relative, notes)
-
-
-def all_frames(clip: Clip, first_pass: FirstPass) -> Iterable[StereoFrame]:
-    """The selected frames: as they were kept in memory, else decoded once more."""
-    return first_pass.frames or clip.stereo_frames(clip.selection())
 
 
 def _counted(frames: Iterable[StereoFrame], geometry: FrameGeometry, count: int, progress: Progress) -> Iterator[Image]:
@@ -205,7 +199,8 @@ def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: Fra
     if guess.unit in ("m", "0.01 mm"):
         fix = f"The values look like {guess.unit}: multiply --depth-unit-mm by {guess.mm_per_unit:g}."
         raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", fix)
-    return [] if guess.unit == "mm" else [f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm."]
+    note = ToDo(f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm.")
+    return [] if guess.unit == "mm" else [note]
 
 
 def _check_stored(images: list[NDArray]) -> list[str]:
@@ -217,7 +212,8 @@ def _check_stored(images: list[NDArray]) -> list[str]:
     if any(each.any() for each in filled):
         least = min(float(image[each].min()) for image, each in zip(images, filled, strict=True) if each.any())
         share = float(np.mean([each.mean() for each in filled]))
-        notes.append(f"depth: numbers from {least:g} on are far above the rest and count as missing, {share:.1%} of it")
+        why = "they are far above the rest, or fill flat patches at the end of the range"
+        notes.append(f"depth: numbers from {least:g} on count as missing, {share:.1%} of it: {why}")
     return notes
 
 
@@ -293,7 +289,7 @@ def write_frames(
         depth = frame.depth
         if methods.filter_in_time:
             depth = temporal_median([other.depth for other in window if other.depth is not None])
-        tools = methods.tools(frame.index).mask | ~geometry.inside | methods.hidden(frame.rgb_u8)
+        tools = methods.tools(frame.index).mask | ~geometry.inside | methods.hidden(frame.index, frame.rgb_u8)
         if methods.shade:
             depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:
@@ -316,6 +312,7 @@ def replace_by_carried(
     segmenter: VideoSegmenter,
     inside: Mask,
     methods: FrameMethods,
+    used: Sequence[int],
     progress: Progress,
 ) -> list[str]:
     """Replace the masks of all written frames, their depth from shading, and the source of the masks in `files.meta`.
@@ -326,6 +323,7 @@ def replace_by_carried(
     Args:
         inside: (H, W) True inside the endoscope's image.
         methods: how depth follows from shading, if it depends on masks, and what frames hide.
+        used: position of every frame in the source.
     Returns:
         Notes for the user, one line each.
     """
@@ -343,13 +341,13 @@ def replace_by_carried(
         write_state(work, {"rows": found_rows})
     for i in range(files.count):
         rgb_u8 = read_color(files.file("images", i))
-        mask = store.mask(i) | ~inside | methods.hidden(rgb_u8)
+        mask = store.mask(i) | ~inside | methods.hidden(used[i], rgb_u8)
         write_mask(files.file("masks", i), mask, TOOL_VALUE)
         if methods.shade is not None:
             depth = np.where(inside, methods.shade(rgb_u8, ~mask), np.float32(0))
             save_png(files.file("depth", i), files.depth_units(depth))
-    rows = [FrameRow(**row) for row in read_state(work)["rows"]]
+    rows = list(read_state(work)["rows"])
     write_rows(files.folder, rows)
     source = found_source(sum(row.share > 0 for row in rows) / files.count, segmenter.name)
     files.meta = replace(files.meta, sources=files.meta.sources | {"masks": source})
-    return [f"masks: {source}. {HINT}"]
+    return [ToDo(f"masks: {source}. {HINT}")]

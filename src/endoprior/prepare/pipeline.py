@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error, number_ranges
-from ..core.shell import changed_options, command
+from ..core.shell import changed_options, command, quoted
 from ..data import write_stir_tracks
 from ..data.description import PATH_RECORD, SIZE_NOT_STATED, PrepareRecord
 from ..data.files import CONFIDENCE
 from ..data.found_tools import FrameRow, mark_moving, read_rows, uncertain_frames, write_rows
+from ..data.image_folders import contents_of
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
+from ..data.load import not_to_prepare
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
 from ..footage.known_facts import KnownFacts
@@ -33,10 +35,12 @@ from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
 from .frame_tools import FOUND, masked_frames
-from .frames import WORK, FrameMethods, all_frames, choose_methods, replace_by_carried, write_frames
+from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
+from .notes import ToDo
 from .parallax.measure import measure_depth
 from .scale.apply import demand_no_unit, use_scale
 from .scale.find import check_scale_options
+from .source import ASSUMED_RATE
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -78,8 +82,8 @@ class _Written(FrameFiles):
 
 
 def prepare(
-    video: Path,
-    out: Path,
+    video: str | Path,
+    out: str | Path,
     cfg: PrepareConfig | None = None,
     progress: Progress = lambda _what, _done, _total: None,
     facts: KnownFacts | None = None,
@@ -87,13 +91,23 @@ def prepare(
     """Write a sequence folder from a video. The same call resumes after an interruption.
 
     Args:
-        video: a file, or a folder of images.
+        video: a file, or a folder of images, or one with such a folder and perhaps one of masks.
         out: a new or empty folder; it appears when the sequence is complete.
         facts: gets facts of the frames, for steps that come later.
     Raises:
         InputError: the video, or a file named by an option, cannot be used; nothing is left behind.
+
+    Example:
+        >>> import endoprior
+        >>> prepared = endoprior.prepare("DATA/images", "PREPARED")
+        >>> len(endoprior.load_sequence("PREPARED"))
+        10
     """
+    video, out = Path(video), Path(out)
     cfg, facts = cfg or PrepareConfig(), facts or KnownFacts()
+    if error := not_to_prepare(video):
+        raise error
+    cfg, own_notes = _with_own_files(video, cfg)
     check_scale_options(cfg.known_length, cfg.shaft_mm)
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
@@ -116,7 +130,7 @@ def prepare(
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
         carried_notes, moving = [], []
         if segmenter is not None:
-            carried_notes = replace_by_carried(files, segmenter, inside, methods, progress)
+            carried_notes = replace_by_carried(files, segmenter, inside, methods, used, progress)
         if cfg.masks == "auto" or segmenter is not None:
             from .unmasked_motion import frames_with_unmasked_motion  # imports torch
 
@@ -124,7 +138,7 @@ def prepare(
             with frame_threads(BYTES_PER_PX * inside.size) as pool:
                 moving = frames_with_unmasked_motion(files.count, rate, files.color, files.tools, inside, pool.map)
         mark_moving(folder, moving)
-        path, motion_notes = _camera_path(cfg, files, first_pass, used, facts, progress)
+        path, motion_notes = _camera_path(cfg, files, clip, first_pass, used, facts, progress)
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
         unexplained, weights = _unexplained(path, files, damaged, facts)
         if path is not None:
@@ -141,9 +155,26 @@ def prepare(
         others = sorted({*unexplained} - {*damaged})
         if path is not None and path.is_unknown and not path.explained.any():
             others = []  # the note on the motion says it
-        notes = [*video_notes, *first_pass.notes, *methods.notes, *carried_notes, *motion_notes, *scale_notes]
+        notes = [*own_notes, *video_notes, *first_pass.notes, *methods.notes]
+        notes += [*carried_notes, *motion_notes, *scale_notes]
         notes += _advice(out, uncertain_frames(read_rows(folder)), moving, others, files.count - len(unexplained))
     return Prepared(out, files.count, first_pass.geometry.size, notes)
+
+
+def _with_own_files(video: Path, cfg: PrepareConfig) -> tuple[PrepareConfig, list[str]]:
+    """The options, with masks and calibration of a folder of images unless others are asked for; and notes."""
+    found, notes = contents_of(video), list[str]()
+    if found and cfg.masks == "auto" and (masks := found.masks):
+        other = f"For none: `--masks none`; to have tools found: pass {quoted(found.images)}"
+        notes.append(f"masks: those in {masks} are used. {other}")
+        cfg = replace(cfg, masks=str(masks))
+    if found and found.frames_per_second is None and cfg.folder_rate is None:
+        what = f"the frame rate of {found.images} is unknown, {ASSUMED_RATE:g}/s assumed"
+        notes.append(ToDo(f"{what}: --folder-rate sets it"))
+    if found and found.calibration and cfg.calibration is None:
+        notes.append(f"calibration: that of {found.calibration}")
+        cfg = replace(cfg, calibration=found.calibration)
+    return cfg, notes
 
 
 def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, FirstPass, int]:
@@ -163,6 +194,9 @@ def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, Fi
         pairs = [(frame.left, frame.right) for frame in first_pass.samples]
         first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, pairs)
         first_pass.notes.append(row_note)
+    if cfg.border == "auto":
+        progress("looking for text", 0, len(first_pass.indices))
+        first_pass.find_text(clip)
     return clip, first_pass, step
 
 
@@ -174,7 +208,7 @@ def _write(
     parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
     files = _Written(folder, _meta(clip, first_pass, methods, step), frames_done(folder, parts))
     used = write_frames(
-        all_frames(clip, first_pass),
+        first_pass.all_frames(clip),
         first_pass.geometry,
         methods,
         files,
@@ -203,7 +237,7 @@ def _meta(clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int) -
 
 
 def _camera_path(
-    cfg: PrepareConfig, files: _Written, first_pass: FirstPass, used: Sequence[int], facts: KnownFacts,
+    cfg: PrepareConfig, files: _Written, clip: Clip, first_pass: FirstPass, used: Sequence[int], facts: KnownFacts,
     progress: Progress,
 ) -> tuple[CameraPath | None, list[str]]:  # fmt: skip
     """Poses of the written frames, None for a static camera; and notes for the user."""
@@ -220,7 +254,7 @@ def _camera_path(
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
-        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used, first_pass.image_names),
+        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used, clip.source.times, first_pass.image_names),
         progress=lambda done: progress("following the camera", done, files.count),
         facts=facts,
     )
@@ -296,7 +330,8 @@ def _usage_notes(damaged: list[int], outside: int) -> list[str]:
     if damaged:
         what = "damaged in the video, or predicted from damaged images before the next key frame"
         fix = "leave them out with --start and --end, or copy the video again"
-        notes.append(f"{what}: frames {number_ranges(damaged)}. They are unexplained_frames of sequence.json; {fix}")
+        where = f"frames {number_ranges(damaged)}. They are unexplained_frames of sequence.json"
+        notes.append(ToDo(f"{what}: {where}; {fix}"))
     if outside:
         notes.append(f"{outside} frames without the color of the inside of a body are left out")
     return notes

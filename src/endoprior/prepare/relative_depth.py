@@ -81,7 +81,8 @@ def fit_shading(images: Sequence[Image], usable: Sequence[Mask], working_distanc
     values = np.stack([np.where(weight > 0.5, brightness, np.nan) for brightness, weight in small])
     seen = np.isfinite(values).any(0)
     if not seen.any():
-        raise input_error("sample images", "usable tissue", "none", "Check the masks, or choose other frames.")
+        fix = "Check masks and exposure, or choose other frames."
+        raise input_error("sample images", "tissue that is neither masked nor white", "none", fix)
     # Remove exposure first: otherwise the median over images would mix brightness levels where masks differ.
     values -= np.array([np.nanmedian(v) if np.isfinite(v).any() else 0 for v in values], np.float32)[:, None, None]
     reference = np.full(seen.shape, np.nan, np.float32)

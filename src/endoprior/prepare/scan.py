@@ -65,12 +65,12 @@ class Scan:
 
 
 def scan_video(
-    video: Path, folder_rate: float = 25.0, progress: Callable[[float, float], None] = lambda _done, _all: None
+    video: Path, folder_rate: float | None = None, progress: Callable[[float, float], None] = lambda _done, _all: None
 ) -> Scan:
     """Look through a video.
 
     Args:
-        folder_rate: frame rate of a folder of images, 1/s.
+        folder_rate: frame rate of a folder of images, 1/s; None: as it says itself, or assumed.
         progress: called with the seconds done, and all.
     Raises:
         InputError: it cannot be opened.

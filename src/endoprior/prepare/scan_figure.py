@@ -28,7 +28,7 @@ def draw_scan(
     video: Path,
     scanned: dict[str, Any],
     path: Path,
-    folder_rate: float = 25.0,
+    folder_rate: float | None = None,
     pictures: Sequence[NDArray[np.uint8]] = (),
 ) -> None:
     """Write the timeline of a video as a PNG file, completely or not at all.

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..core.checks import input_error
+from ..data.files import of_type, read_json, read_parts
 from ..footage.components import runs
+from ..footage.disturbances import FrameQuality
 from .scan import Look, Scan
 
 SHORTEST_S = 1.0  # a segment is at least so long, s
@@ -146,6 +150,47 @@ def as_json(scan: Scan) -> dict[str, Any]:
             },
         },
     }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """One of `segments` in `scan.json`."""
+
+    number: int
+    start: float
+    end: float
+    score: float
+    used: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _NotUsable:
+    """One of `not_usable` in `scan.json`."""
+
+    start: float
+    end: float
+    reason: str
+
+
+def read_scan(file: Path) -> dict[str, Any]:
+    """What `as_json` gave, from a file that holds it; it may come from somebody else.
+
+    Raises:
+        InputError: it cannot be a scan.
+    """
+    fix = "remove it, and repeat the command: the video is scanned again."
+    numbers = tuple[float, ...]
+    looks: dict[str, Any] = dict.fromkeys(("seconds", "weight", *FrameQuality._fields), numbers)
+    looks |= {"problem": tuple[str, ...], "shift": tuple[float | int | None, ...]}
+    parts = {"seconds": float, "segments": tuple[_Segment, ...], "not_usable": tuple[_NotUsable, ...], "cuts": numbers}
+    checked = read_parts(file, parts | {"looks": dict[str, list]}, fix)
+    for name, hint in looks.items():
+        of_type(file, hint, checked["looks"].get(name), f"looks.{name}", fix)
+    if len({len(values) for values in checked["looks"].values()}) != 1:
+        raise input_error(file, "lists of one length in looks", "others", fix)
+    if unknown := {each.reason for each in checked["not_usable"]} - {*WORDS}:
+        raise input_error(file, f"a reason of {', '.join(WORDS)}", min(unknown), fix)
+    return read_json(file, fix)
 
 
 def best_start(scanned: dict[str, Any], span: tuple[float, float], seconds: float) -> float:

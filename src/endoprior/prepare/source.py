@@ -17,15 +17,21 @@ from PIL.Image import DecompressionBombError, Image
 from PIL.Image import open as open_image
 
 from ..core.checks import InputError, input_error
-from ..data.files import entries, files_with
-from ..data.frame_files import one_per_frame
+from ..core.shell import quoted
+from ..data.files import entries, files_with, or_neighbor
+from ..data.frame_files import missing_numbers, one_per_frame
+from ..data.image_folders import contents_of, image_folders
 from ..data.images import decode_image, describe_pixels
+from ..data.load import what_is_in
+from ..data.pixels import is_matte
 from ..data.reading import kind_of
 from ..data.video_files import STILL_SUFFIXES, is_animated_webp
 from .decoding import usual_rate
-from .video import COPY_AGAIN, SmallImage, SourceFrame, Video, demand_size
+from .video import COPY_AGAIN, SmallImage, SourceFrame, Video, demand_size, transparent
 
 OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")  # suffixes of images that are counted, but not read
+WANTED = "images (PNG, JPEG, TIFF, BMP) or a video file"
+ASSUMED_RATE = 25.0  # frame rate of a folder that does not tell its own, 1/s
 
 
 class ImageFolder:
@@ -33,12 +39,14 @@ class ImageFolder:
 
     start, was_damaged, clock_is_arbitrary = 0.0, False, False
 
-    def __init__(self, path: Path, frames_per_second: float) -> None:
+    def __init__(self, path: Path, known_rate: float | None) -> None:
         """List the folder; raises InputError if it has no images, or several of each frame."""
-        self.path, self.frames_per_second = path, frames_per_second
+        self.path, self.rate_is_assumed = path, known_rate is None
+        self.frames_per_second = frames_per_second = ASSUMED_RATE if known_rate is None else known_rate
+        self._transparent: set[int] = set()  # positions of images of which a part is transparent
         self.files, self._left_out = one_per_frame(path, files_with(path, STILL_SUFFIXES), "images")
         if not self.files:
-            raise input_error(path, "images (PNG, JPEG, TIFF, BMP) or a video file", "none", "Check the path.")
+            raise input_error(path, WANTED, "none", "pass the folder that holds them.")
         self.times = [index / frames_per_second for index in range(len(self.files))]
         self.num_frames, self.seconds = len(self.files), len(self.files) / frames_per_second
         self.height, self.width = self._stored(self.files[0]).shape[:2]
@@ -54,6 +62,11 @@ class ImageFolder:
         stacks = [file for file in self.files if file.suffix.lower() in (".tif", ".tiff")]
         if pages := sum(max(cv2.imcount(str(file)) - 1, 0) for file in stacks):
             found.append(f"only the first image of each TIFF is used; {pages} more are not")
+        if missing := missing_numbers(self.files):
+            found.append(missing)
+        if self._transparent:
+            fix = f"To leave it out: `--masks {quoted(self.path)} --mask-tool-value low`"
+            found.append(f"{transparent(len(self._transparent))}. {fix}")
         if self._bits != 8:
             found.append(f"images of 16 bits a channel: {self._bits} of 16 bits are in use, which become 0 to 255")
         left_out = [self._left_out] if self._left_out else []
@@ -69,9 +82,11 @@ class ImageFolder:
         if stored.shape[:2] != (self.height, self.width):
             got = f"{stored.shape[1]}x{stored.shape[0]}"
             raise input_error(file, f"{self.width}x{self.height} px like the first image", got, "Make them equal.")
+        if is_matte(stored[..., 3:]):
+            self._transparent.add(index)
         if stored.dtype == np.uint16:
             stored = (stored >> (self._bits - 8)).astype(np.uint8)
-        return SourceFrame(index, self.times[index], np.ascontiguousarray(stored[..., ::-1]))
+        return SourceFrame(index, self.times[index], np.ascontiguousarray(stored[..., 2::-1]))
 
     def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole time range."""
@@ -83,26 +98,27 @@ class ImageFolder:
         """Bits a channel that are in use, at least 8. Medical cameras write 10 or 12 bits into files of 16."""
         if self._stored(self.files[0]).dtype == np.uint8:
             return 8
-        largest = max(int(image.max()) for image in map(self._stored, self.files) if image.dtype == np.uint16)
+        largest = max(int(image[..., :3].max()) for image in map(self._stored, self.files) if image.dtype == np.uint16)
         return max(largest.bit_length(), 8)
 
     @staticmethod
     def _stored(file: Path) -> NDArray:
-        """(H, W, 3) blue, green, red of 8 or 16 bits."""
-        pixels = decode_image(file, None, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-        if pixels.dtype not in (np.uint8, np.uint16):
+        """(H, W, 3 or 4) blue, green, red and maybe alpha of 8 or 16 bits."""
+        pixels = decode_image(file, None)
+        if pixels.dtype not in (np.uint8, np.uint16) or pixels.shape[2:] not in ((), (3,), (4,)):
             raise input_error(file, "an image of 8 or 16 bits a channel", describe_pixels(pixels), "Save it as PNG.")
-        return pixels
+        return np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else pixels
 
 
 class Animation:
     """An animated WebP file, which FFmpeg does not read."""
 
-    start, notes, was_damaged, clock_is_arbitrary = 0.0, (), False, False
+    start, was_damaged, clock_is_arbitrary = 0.0, False, False
 
     def __init__(self, path: Path) -> None:
         """Read the durations; raises InputError if the file cannot be read."""
         self.path = path
+        self.notes: list[str] = []  # of the images, after a complete iteration
         try:
             with open_image(path) as file:
                 self.width, self.height = file.size
@@ -117,10 +133,14 @@ class Animation:
         self.frames_per_second = usual_rate(self.times, [])
 
     def __iter__(self) -> Iterator[SourceFrame]:
+        count = 0
         with open_image(self.path) as file:
             for index, time in enumerate(self.times):
                 file.seek(index)
-                yield SourceFrame(index, time, np.array(file.convert("RGB")))
+                pixels = np.array(file.convert("RGBA"))
+                count += is_matte(pixels[..., 3:])
+                yield SourceFrame(index, time, np.ascontiguousarray(pixels[..., :3]))
+        self.notes = [f"{self.path.name}: {transparent(count)}"] if count else []
 
     def glimpses(self, _start: float, _end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole file."""
@@ -156,8 +176,11 @@ def _resized(
     return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8) if is_gray else small
 
 
-def open_source(path: Path, frames_per_second: float = 25.0) -> Source:
-    """Open a video file or a folder of images.
+def open_source(path: Path, folder_rate: float | None = None) -> Source:
+    """Open a video file or a folder of images, which may lie in a folder of their own beside their masks.
+
+    Args:
+        folder_rate: frame rate of a folder, 1/s; None: that of its `sequence.json`, else `ASSUMED_RATE`.
 
     Returns:
         The source. `num_frames` and `seconds` are the announced number of images and duration, 0 if unknown; `times`
@@ -166,8 +189,20 @@ def open_source(path: Path, frames_per_second: float = 25.0) -> Source:
         InputError: the file does not exist or cannot be read.
     """
     if (kind := kind_of(path)) == "a folder":
-        return ImageFolder(path, frames_per_second)
+        return _open_folder(path, folder_rate)
     if kind != "a file":
-        got = "no such file" if kind == "nothing" else kind
-        raise input_error(path, "a video file or a folder of images", got, "Check the path.")
+        got = "no such file or folder" if kind == "nothing" else kind
+        fix = or_neighbor("correct the path.", path) if kind == "nothing" else "correct the path."
+        raise input_error(path, "a video file or a folder of images", got, fix)
     return Animation(path) if is_animated_webp(path) else Video(path)
+
+
+def _open_folder(path: Path, rate: float | None) -> ImageFolder:
+    if found := contents_of(path):
+        return ImageFolder(found.images, rate or found.frames_per_second)
+    if files_with(path, STILL_SUFFIXES):
+        return ImageFolder(path, rate)
+    known = what_is_in(path)
+    if known is None and (several := image_folders(path)):
+        known = f"images in {', '.join(each.name for each in several)}", f"pass one, such as {quoted(several[0])}."
+    raise input_error(path, WANTED, *(known or ("none", "pass the folder that holds images, or a video.")))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,15 +16,18 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
-from av.error import ArgumentError, FFmpegError
+from av.error import FFmpegError
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.shell import quoted
+from ..data.images import MIRRORED, TURNED, upright
+from ..data.pixels import is_matte
 from ..data.reading import MOST_PIXELS
 from ..data.video_files import open_container, starts_of_parts, what_it_is
 from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, in_seconds, is_cover, packet_times, usual_rate
+from .notes import ToDo
 
 LOST_SHARE, LOST_IMAGES = 0.02, 2  # truncated: more of the duration, and more images, are missing at the end
 STATES_END = ("matroska,webm", "nut")
@@ -33,6 +37,8 @@ PIXEL_ASPECTS = (0.25, 4.0)  # plausible width of a pixel, in heights
 LOOKED_AT = 300  # most images that are decoded to reach the time of a glimpse: as many as between two key frames
 SmallImage = Callable[..., NDArray[np.uint8]]
 """Called with a width and a height, px: the image (h, w, 3) of that size, or (h, w) gray values with `is_gray`."""
+HIGH_RANGE = {16: ("PQ", "smpte2084"), 18: ("HLG", "arib-std-b67")}
+"""Transfer characteristics of HDR video by their number in ITU-T H.273: what they are called, and by FFmpeg."""
 COPY_AGAIN = "Copy or export it again."
 
 
@@ -57,6 +63,7 @@ class Video:
         self.path, self.start = path, 0.0
         self._size = (0, 0)
         self._found: list[str] = []
+        self._transfer = 0  # of the levels, by its number in ITU-T H.273; some files tell it with their images only
         if path.stat().st_size == 0:
             raise input_error(path, "a video file", "an empty file", "Copy it again.")
         with self._open() as (container, track):
@@ -71,7 +78,7 @@ class Video:
             aspect = track.sample_aspect_ratio or Fraction(1)
             self._aspect = aspect if PIXEL_ASPECTS[0] <= aspect <= PIXEL_ASPECTS[1] else Fraction(0)
             unread = _unread_parts(path, container.format.name, end)
-            self._unused = [*_other_tracks(path.absolute(), container, track), *unread]
+            self._of_file = [*_other_tracks(path.absolute(), container, track), *unread]
             # The duration may be that of all parts.
             self._announced_end = 0.0 if unread else _announced_end(container, track)
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
@@ -97,7 +104,7 @@ class Video:
     @property
     def notes(self) -> list[str]:
         """What is particular about the file, one line each; of its images after a complete iteration."""
-        notes, (width, height) = list(self._unused), self._size
+        notes, (width, height) = list(self._of_file), self._size
         if self.pixel_aspect != 1:
             aspect, shown = f"{self._aspect.numerator}:{self._aspect.denominator}", self._shown_width(width)
             notes.append(
@@ -105,7 +112,7 @@ class Video:
             )
         elif self._aspect == 0:
             notes.append(self._note("the stated aspect ratio of pixels is not plausible and is ignored"))
-        return notes + self._found
+        return notes + _of_high_range(self.path, self._transfer) + self._found
 
     def _note(self, words: str) -> str:
         return f"{self.path.name}: {words}"
@@ -113,16 +120,19 @@ class Video:
     def __iter__(self) -> Iterator[SourceFrame]:
         timeline, lost, broken = Timeline(self._step), [], ""
         began, last, shown_until = None, 0.0, 0.0
-        index = interlaced = 0
+        index = interlaced = mirrored = see_through = 0
         with self._open() as (container, track):
             try:
                 images = decode(container, track, lost, one_thread=self.was_damaged, weave=self.weave)
                 for image, seconds in timeline.along((image, image.seconds) for image in images):
                     began = self.start = seconds if began is None else began
+                    self._transfer = image.frame.color_trc
                     last = max(last, seconds)
                     own = float((image.frame.duration or 0) * (image.frame.time_base or 0))
                     shown_until = max(shown_until, seconds + max(self._step, own))
                     interlaced += image.interlaced
+                    mirrored += image.orientation in MIRRORED
+                    see_through += _is_transparent(image.frame)
                     self.was_damaged |= image.damaged
                     yield SourceFrame(index, seconds - began, self._rgb(image, index), image.damaged)
                     index += 1
@@ -135,7 +145,10 @@ class Video:
         particular = {
             f"damaged images that cannot be decoded and are left out: {len(lost)}": lost,
             f"joined of {parts}, each with times of its own; they follow each other": timeline.restarts,
+            f"{timeline.repeated} time stamps repeat the one before; such images are spread in time": timeline.repeated,
             f"times in disorder, images that are shown too late: {timeline.misplaced}": timeline.misplaced,
+            transparent(see_through): see_through,
+            f"{mirrored} images are stored mirrored; they are used as the file says that they are shown": mirrored,
             f"{interlaced} images are interlaced; one field of each is used, with its rows filled": is_filled,
         }
         self._found += [self._note(words) for words, is_so in particular.items() if is_so]
@@ -197,7 +210,7 @@ class Video:
         if shown != width:
             how = cv2.INTER_CUBIC if shown > width else cv2.INTER_AREA
             rgb_u8 = cv2.resize(rgb_u8, (shown, height), interpolation=how)
-        return np.ascontiguousarray(np.rot90(rgb_u8, image.turns), np.uint8)
+        return np.asarray(upright(rgb_u8, image.orientation), np.uint8)
 
     def _shown_width(self, width: int) -> int:
         """Width of an image of square pixels. It is even, so that the halves of a stereo image stay halves."""
@@ -234,8 +247,8 @@ class Video:
         try:
             container = open_container(self.path)
         except (FFmpegError, OSError, UnicodeError) as error:
-            # FFmpeg raises ArgumentError for a format that is not in the list.
-            unlisted = isinstance(error, ArgumentError)
+            # FFmpeg calls a format that is not in the list an invalid argument.
+            unlisted = isinstance(error, FFmpegError) and error.errno == errno.EINVAL
             reason = "a file of another kind" if unlisted else getattr(error, "strerror", None) or str(error)
             got = what_it_is(self.path) or reason
             fix = "Pass a folder with one file for each image." if got == "one image" else COPY_AGAIN
@@ -251,12 +264,22 @@ class Video:
             yield container, track
 
 
+def transparent(count: int) -> str:
+    """A note on images that have an alpha channel."""
+    return f"{count} images have transparent parts; their color is used there, whatever it is"
+
+
+def _is_transparent(frame: av.VideoFrame) -> bool:
+    has_alpha = any(component.is_alpha for component in frame.format.components)
+    return has_alpha and is_matte(frame.to_ndarray(format="rgba")[..., 3])
+
+
 def _small(image: DecodedImage, width: int, height: int, is_gray: bool = False) -> NDArray[np.uint8]:
-    if image.turns % 2:
+    if image.orientation in TURNED:
         width, height = height, width
     kind = "gray8" if is_gray else "rgb24"
     small = image.frame.reformat(width=width, height=height, format=kind, interpolation="AREA")
-    return np.ascontiguousarray(np.rot90(small.to_ndarray(), image.turns), np.uint8)
+    return np.asarray(upright(small.to_ndarray(), image.orientation), np.uint8)
 
 
 def demand_size(path: Path, width: int, height: int) -> None:
@@ -289,6 +312,20 @@ def _unread_parts(path: Path, format_name: str, end: int) -> list[str]:
     return [f"{path.name}: of {len(starts)} joined files only {first} used; join them with `ffmpeg -f concat`"]
 
 
+def _of_high_range(path: Path, number: int) -> list[str]:
+    """A note if the levels of a video, by the number of their transfer, do not mean what those of ordinary video do."""
+    if number not in HIGH_RANGE:
+        return []
+    name, transfer = HIGH_RANGE[number]
+    linear = f"zscale=tin={transfer}:min=bt2020nc:pin=bt2020:t=linear:npl=100,format=gbrpf32le,tonemap=hable"
+    ordinary = f"{linear},zscale=t=bt709:m=bt709:p=bt709:r=tv,format=yuv420p"
+    usual = path.with_name(f"{path.stem}_sdr.mp4")
+    words = ["ffmpeg", "-i", path, "-vf", ordinary, "-crf", "10", usual]
+    fix = f"`{' '.join(map(quoted, words))}`"
+    what = f"{path.name}: HDR video ({name}) is read as ordinary video"
+    return [ToDo(f"{what}: colors are wrong, mostly pale. Fix: {fix}")]
+
+
 def _other_tracks(path: Path, container: InputContainer, used: VideoStream) -> list[str]:
     """A note if there are other tracks of images than the one that is used."""
     others = [track for track in container.streams.video if track.index != used.index and not is_cover(track)]
@@ -306,5 +343,6 @@ def _other_tracks(path: Path, container: InputContainer, used: VideoStream) -> l
         second = path.with_name(f"{path.stem}_right{path.suffix}")
         words = ["ffmpeg", "-i", path, "-map", f"0:{equal[0].index}", "-c", "copy", second]
         split = " ".join(map(quoted, words))
-        notes.append(f"{path.name}: if the tracks are two cameras: `{split}`, then add `--right {quoted(second)}`")
+        fix = f"`{split}`, then add `--right {quoted(second)}`"
+        notes.append(ToDo(f"{path.name}: if the tracks are two cameras: {fix}"))
     return notes

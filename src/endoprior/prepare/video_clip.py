@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.shell import quoted
 from ..data.frame_files import match_names
+from ..footage.interlacing import Interlacing
 from .calibration import Calibration
 from .config import Layout, PrepareConfig
 from .frame_geometry import MIN_SIDE_PX
+from .notes import ToDo
 from .source import ImageFolder, Source, open_source
 from .stereo_layout import GLIMPSES, camera_size, find_layout, split_cameras
 from .video import SourceFrame, Video
@@ -184,7 +187,8 @@ class Clip:
         """Open the files and detect the layout; raises InputError if a file cannot be used."""
         self._cfg, self.swap = cfg, cfg.swap_eyes
         self.source: Source = open_source(video, cfg.folder_rate)
-        second = open_source(cfg.right, cfg.folder_rate) if cfg.right else None
+        of_first = self.source.frames_per_second if isinstance(self.source, ImageFolder) else None
+        second = open_source(cfg.right, cfg.folder_rate or of_first) if cfg.right else None
         self._sources = [self.source, *([second] if second else [])]
         width, height = self.source.width, self.source.height
         if min(width, height) < MIN_SIDE_PX:
@@ -208,6 +212,7 @@ class Clip:
         self._rate = self._pairing.rate if self._pairing else self.source.frames_per_second
         self.frames_per_second = cfg.frames_per_second or self._rate
         self._unpaired = 0  # images of the first video, in the last iteration, without one of the second at their time
+        self._interlacing = Interlacing()  # what tells, in the last iteration, that rows are of two times
         self.only: frozenset[int] | None = None
         """Positions in the source of the frames to use, of those selected; None for all."""
 
@@ -222,6 +227,8 @@ class Clip:
         notes = [note for source in self._sources for note in source.notes]
         if self._rescaled:
             notes.append("the calibration belongs to the stored pixels, which are not square; it is scaled with them")
+        if self._interlacing.is_certain:
+            notes.append(_comb_note(self.source))
         if self._pairing and self._pairing.note:
             notes.append(self._pairing.note)
         if self._unpaired:
@@ -252,16 +259,23 @@ class Clip:
             raise input_error(self._sources[1].path, want, "none", fix)
 
     def _all_frames(self) -> Iterator[StereoFrame]:
+        self._interlacing = Interlacing()
         if self._pairing is None:
             for image in self.source:
+                self._look_at_rows(image)
                 yield self._stereo_frame(image, *split_cameras(image.rgb_u8, self.layout))
             return
         self._unpaired = 0
         for image, other in self._pairing:
+            self._look_at_rows(image)
             if other is None:
                 self._unpaired += self._cfg.start <= image.seconds < self._cfg.end
             else:
                 yield self._stereo_frame(image, image.rgb_u8, other.rgb_u8, other.damaged)
+
+    def _look_at_rows(self, image: SourceFrame) -> None:
+        if self.layout != "interlaced" and self._cfg.start <= image.seconds < self._cfg.end:
+            self._interlacing.see(image.rgb_u8)
 
     def _stereo_frame(
         self, image: SourceFrame, first: Image, second: Image | None, damaged: bool = False
@@ -269,6 +283,16 @@ class Clip:
         if self.swap and second is not None:
             first, second = second, first
         return StereoFrame(image.index, image.seconds, first, second, damaged or image.damaged)
+
+
+def _comb_note(source: Source) -> str:
+    """That images of a progressive video have rows of two times, and the command that helps."""
+    path, fix = source.path, "deinterlace the video before its images are exported"
+    if not isinstance(source, ImageFolder):
+        even = path.with_name(f"{path.stem}_progressive.mp4")
+        words = ["ffmpeg", "-i", path, "-vf", "bwdif=deint=all", "-crf", "10", even]
+        fix = f"`{' '.join(map(quoted, words))}`"
+    return ToDo(f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}")
 
 
 def _of_square_pixels(calibration: Calibration | None, source: Source) -> tuple[Calibration | None, bool]:

@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from ..core.checks import InputError, input_error
-from ..system.atomic import CannotWrite, complete_folder, reject_current_folder, reject_occupied, write_json, writing
+from ..system.atomic import (
+    CannotWrite,
+    complete_folder,
+    read_json_object,
+    reject_current_folder,
+    reject_occupied,
+    write_json,
+    writing,
+)
 from ..system.file_lock import locked
 
 PLAN = "plan.json"  # inputs and options of the folder. If they changed, the work starts from the beginning.
@@ -38,7 +46,7 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
         raise input_error(out, "a path where a folder can be created", got, "Choose another path.") from None
     with locked(out, work_lock(out)):
         try:
-            if _plan_of(folder) != json.loads(json.dumps(plan)):
+            if read_json_object(folder / PLAN) != json.loads(json.dumps(plan)):
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir()
                 write_json(folder / PLAN, plan)
@@ -66,13 +74,6 @@ def _work_folder(out: Path) -> Path:
 def delete_plan(folder: Path) -> None:
     """Make an interrupted run start from the beginning, because the next step cannot be repeated."""
     (folder / PLAN).unlink(missing_ok=True)
-
-
-def _plan_of(folder: Path) -> Any:
-    try:
-        return json.loads((folder / PLAN).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
 
 
 def frames_done(folder: Path, parts: list[str]) -> int:

@@ -79,6 +79,13 @@ def joint_texture_prior(
         (H, W) prior in [0, 1]; 0 off the tissue, and everywhere when the mask is empty.
     Raises:
         ValueError: a shape or type differs, or a color is not finite or outside [0, 1].
+
+    Example:
+        >>> import endoprior
+        >>> frame = endoprior.load_sequence("DATA")[0]
+        >>> prior = endoprior.joint_texture_prior(frame.rgb, frame.tissue_mask)
+        >>> prior.shape, bool((prior[~frame.tissue_mask] == 0).all())
+        ((48, 64), True)
     """
     rgb, tissue_mask = np.asarray(rgb), np.asarray(tissue_mask)
     check_shape("rgb:H,W,3 tissue_mask:H,W", rgb=rgb, tissue_mask=tissue_mask)

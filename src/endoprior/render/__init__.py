@@ -9,8 +9,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol, get_args
 
-from ..core.checks import InputError
+from ..core.checks import input_error, or_did_you_mean
 from ..core.config import Backend
+from ..core.kernel_folder import without_kernel_cache
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,9 +49,13 @@ def load(backend: Backend) -> Rasterizer:
         InputError: there is no backend of that name, or the library it needs, gsplat or Triton, is not installed.
     """
     if backend not in get_args(Backend):
-        names = ", ".join(get_args(Backend))
-        raise InputError(f"backend: expected one of {names}; got {backend!r}. Choose one of those.")
-    return import_module(f".{backend}", __package__).rasterize
+        names = get_args(Backend)
+        fix = or_did_you_mean("choose one of them.", backend, names)
+        raise input_error("backend", f"one of {', '.join(names)}", repr(backend), fix)
+    try:
+        return import_module(f".{backend}", __package__).rasterize
+    except RuntimeError as error:
+        raise without_kernel_cache(error) or error from None
 
 
 def load_many(backend: Backend) -> Callable[..., list[RenderOutput]]:

@@ -77,7 +77,7 @@ def jacobian_limits(camera: Camera) -> tuple[float, float, float, float]:
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotations of (N, 4) quaternions (w, x, y, z) of any length but zero."""
-    w, x, y, z = _unit(quats).unbind(-1)
+    w, x, y, z = unit(quats).unbind(-1)
     entries = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -124,7 +124,7 @@ def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Te
     per_px = _local_per_px(cov2d, det, torch.stack([spread_x[:, :2], spread_y[:, :2]], 1))
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
     towards = splats.means - torch.as_tensor(camera.center, dtype=splats.means.dtype, device=splats.means.device)
-    return means2d, cov2d, det, z, sh.colors(splats.sh, _unit(towards)), per_px @ color_slopes(splats)
+    return means2d, cov2d, det, z, sh.colors(splats.sh, unit(towards)), per_px @ color_slopes(splats)
 
 
 def _local_per_px(cov2d: Tensor, det: Tensor, spread: Tensor) -> Tensor:
@@ -143,7 +143,7 @@ def color_slopes(splats: Splats) -> Tensor:
     return splats.means.new_zeros(len(splats), 2, 3) if splats.color_slopes is None else splats.color_slopes
 
 
-def _unit(vectors: Tensor) -> Tensor:
+def unit(vectors: Tensor) -> Tensor:
     """(N, C) vectors at length 1. They are brought near it first, so that no square vanishes or overflows."""
     vectors = vectors / vectors.detach().abs().amax(-1, keepdim=True)
     return vectors / vectors.norm(dim=-1, keepdim=True)

@@ -102,7 +102,7 @@ def _compile(config: str, progress: Callable[[int, int], None]) -> bool:
 
 def _marker(key: str) -> Path:
     """The file that says that kernels are compiled, where Numba keeps those of this package."""
-    beside = PACKAGE / "__pycache__" if os.access(PACKAGE, os.W_OK) else Path.home() / ".cache" / "endoprior"
+    beside = PACKAGE / "__pycache__" if os.access(PACKAGE, os.W_OK) else Path(os.path.expanduser("~/.cache/endoprior"))
     return Path(os.environ.get("NUMBA_CACHE_DIR") or beside) / f"endoprior_{key}.ready"
 
 

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Literal, TextIO
 
 from ..core.checks import InputError, input_error, number_ranges
+from ..core.config_io import from_dict
 from ..core.shell import command
 from ..data.found_tools import read_rows
 from ..data.reading import read_bytes
-from ..model.windowed_scene import window_file
-from ..system.atomic import write_text
+from ..system.atomic import read_json_object, write_text
 from ..training.trainer import Observer, Stage, StepReport, Trainer
-from .folder import CONFIG, LOG, SCENE
+from .folder import CONFIG, LOG
 
 LOG_EVERY = 10  # iterations between two lines
 MISSED = "missed_tool_frames"
 """Frames whose masks likely miss a tool: in the last line, in the protocol of `metrics.json` and in `StepReport`."""
-MARGIN = "tool_margin_px"
 """Pixels around tool masks that were left out: in `config.json` of a run, and in the protocol of `metrics.json`."""
 
 
@@ -53,7 +52,7 @@ def read_log(log: Path, *names: str) -> list[dict[str, Any]]:
     """The lines of `log.jsonl`, without a last one that a crash cut short; each must have the `names`.
 
     Raises:
-        InputError: it cannot be read, or another line is broken.
+        InputError: it cannot be read, or another line is broken: no JSON, or a value of another type.
     """
     lines, rows = read_bytes(log, "the log of a training").tobytes().splitlines(), list[dict[str, Any]]()
     for number, text in enumerate(lines, 1):
@@ -61,12 +60,34 @@ def read_log(log: Path, *names: str) -> list[dict[str, Any]]:
             row = json.loads(text)
         except (ValueError, RecursionError):
             row = None
-        if isinstance(row, dict) and row.keys() >= set(names):
+        if isinstance(row, dict) and row.keys() >= set(names) and _is_line(row):
             rows.append(row)
         elif number < len(lines):
             found = ascii(text[:40].decode(errors="replace"))
             raise input_error(f"{log}, line {number}", "an iteration as JSON", found, "Remove this line.")
     return rows
+
+
+@dataclass(frozen=True)
+class _Line:
+    """What a line of the log may hold."""
+
+    stage: Literal["coarse", "fine"] = "fine"
+    iteration: int = 0
+    num_gaussians: int = 0
+    event: dict[str, int] = field(default_factory=dict)
+    missed_tool_frames: tuple[int, ...] = ()
+    terms: dict[str, float] = field(default_factory=dict)
+    seconds: float = 0.0
+    window: int = 0
+
+
+def _is_line(row: dict[str, Any]) -> bool:
+    try:
+        from_dict(_Line, row)
+    except InputError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -102,15 +123,8 @@ def growth_of(run: Path) -> Growth | None:
 
 def mask_facts(run: Path) -> dict[str, Any]:
     """For the protocol of `metrics.json`: what the training in a run folder found out about tool masks."""
-    about = _config(run)
-    windows, facts = _windows(about), dict[str, Any]()
-    folders = [window_file(run / SCENE, k).parent for k in range(len(windows))]
-    margins = [_config(folder).get(MARGIN) for folder in folders] or [about.get(MARGIN)]
-    if all(isinstance(margin, int) for margin in margins):
-        facts[MARGIN] = margins if windows else margins[0]
-    if (missed := missed_tools_of(run)) is not None:
-        facts[MISSED] = missed
-    return facts
+    missed = missed_tools_of(run)
+    return {} if missed is None else {MISSED: missed}
 
 
 def missed_tools_of(run: Path) -> list[int] | None:
@@ -142,16 +156,13 @@ def missed_tools_line(run: Path, data: Path) -> str:
     if not (frames := sorted({*met, *moving})):
         return ""
     words = f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames)}"
-    return f"Tools are likely missed in {words}. To look and correct: `{command('view', data)}`, then train again."
+    steps = f"`{command('view', data)}`, then `{command('train', data, 'RUN')}`"
+    return f"Tools are likely missed in {words}. To look and correct: {steps}."
 
 
 def _config(run: Path) -> dict[str, Any]:
     """The `config.json` of a run; empty where there is none that can be read."""
-    try:
-        about = json.loads((run / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return about if isinstance(about, dict) else {}
+    return read_json_object(run / CONFIG) or {}
 
 
 def _windows(about: dict[str, Any]) -> list[Any]:

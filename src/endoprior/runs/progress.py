@@ -29,8 +29,10 @@ def training_progress() -> Iterator[Observer]:
         with _bar() as observer:
             yield observer
     elif _in_notebook():
-        yield _lines(NOTEBOOK_EVERY_SECONDS, _say_in_place)
-        print(file=sys.stderr)
+        try:
+            yield _lines(NOTEBOOK_EVERY_SECONDS, _say_in_place)
+        finally:  # also after "Interrupt": what comes next begins on a line of its own
+            print(file=sys.stderr)
     else:
         yield _lines(PLAIN_EVERY_SECONDS, say)
 

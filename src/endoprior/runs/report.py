@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.geometry import length_unit
 from ..data import FrameSequence
+from ..evaluation.context import read_frame_scores, read_scores
 from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
@@ -40,8 +41,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     carried on, beside the input; then the training curve, the PSNR of each test frame, and the scores.
     """
     sequence = sequence.with_poses(scene.cameras)
-    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
+    scores, per_frame = read_scores(run / "metrics.json")["scores"], read_frame_scores(run / "per_frame.json")
     log = read_log(run / LOG, "stage", "terms")
     rows = [*_image_rows(scene, sequence), _side_row(scene, sequence), _texture_row(scene, sequence)]
     # An own canvas: `pyplot` would choose a backend for the whole process.
@@ -59,7 +59,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
     _plot_loss(loss_axis, log)
     _plot_psnr(psnr_axis, per_frame)
-    _write_scores(table_axis, metrics, sequence.depth_is_relative)
+    _write_scores(table_axis, scores, sequence.depth_is_relative)
     save_figure(figure, path)
 
 
@@ -122,7 +122,7 @@ def _plot_loss(axis: Axes, log: list[dict]) -> None:
         axis.legend(fontsize=7)
 
 
-def _plot_psnr(axis: Axes, per_frame: list[dict]) -> None:
+def _plot_psnr(axis: Axes, per_frame: Sequence[dict[str, float]]) -> None:
     points = [(row["index"], row["psnr_tissue"]) for row in per_frame if "psnr_tissue" in row]
     if points:
         axis.plot(*zip(*points, strict=True), "o-", color="tab:blue", markersize=4)
@@ -131,8 +131,7 @@ def _plot_psnr(axis: Axes, per_frame: list[dict]) -> None:
     axis.grid(alpha=0.3)
 
 
-def _write_scores(axis: Axes, metrics: dict, relative: bool) -> None:
-    scores = metrics["scores"]
+def _write_scores(axis: Axes, scores: dict[str, float], relative: bool) -> None:
     shown = [(all_scores()[name], scores[name]) for name in SHOWN_SCORES if name in scores]
     lines = [f"{score.label:<22}{score.text(value, relative):>14}" for score, value in shown]
     axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)

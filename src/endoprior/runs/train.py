@@ -12,6 +12,8 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
+from ..check.errors import find_errors
+from ..compute.parallel_kernels import demand_unforked
 from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
@@ -24,8 +26,8 @@ from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
 from ..system.atomic import write_text, writing
 from ..system.console import complain
 from ..system.memory import freed_memory_kept
-from ..tool_masks.margin import with_tool_margin
 from ..training.divergence import Diverged
+from ..training.error_sources import with_error_sources
 from ..training.preflight import note_on_budget, reject_ignored_options, reject_too_large
 from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
 from . import kernel_cache
@@ -47,7 +49,7 @@ from .folder import (
     save_checkpoint,
     sequence_of_run,
 )
-from .log import MARGIN, cut_log, log_writer, read_log
+from .log import cut_log, log_writer, read_log
 from .progress import is_watched, training_progress
 
 LAST_GOOD = "last_good.safetensors"  # the scene just before its training diverged
@@ -68,7 +70,8 @@ def train(
     """Train one scene.
 
     Args:
-        sequence: from `load_sequence`, read as `cfg.data` says; None with `resume`: the sequence of the run.
+        sequence: from `load_sequence`. One that was opened without a `DataConfig` is read as `cfg.data` says, another
+            one must agree with it. None with `resume`: the sequence of the run.
         cfg: from `preset`; None with `resume`: the config of the run.
         out: run folder for config, log, checkpoints and `scene.safetensors`; None keeps everything in memory.
         resume: continue the run in `out`, from its last checkpoint if there is one.
@@ -81,6 +84,14 @@ def train(
         CannotWrite: a file cannot be written; the last complete state is kept.
         KeyboardInterrupt: the user stopped; a checkpoint has been written.
         ValueError: no sequence or no config without `resume`.
+        RuntimeError: this process is a fork of one that has rendered or trained.
+
+    Example:
+        >>> import endoprior
+        >>> config = endoprior.preset("preview", iterations=3, gaussians=200)
+        >>> scene = endoprior.train(endoprior.load_sequence("DATA"), config, out="RUN")
+        >>> scene.render(time=0.5).expected_depth.shape
+        torch.Size([48, 64])
     """
     if resume and out is not None:
         cfg = config_of_run(Path(out)) if cfg is None else cfg
@@ -112,9 +123,11 @@ def start_run(
     Raises:
         InputError: see `train`.
     """
+    demand_unforked()
     reject_ignored_options(cfg)
     if note := note_on_budget(cfg):
         say(f"note: {note}")
+    sequence = sequence.read_as(cfg.data)
     for field in fields(cfg.data):  # was the sequence read as the config says? Both eyes are in any case
         wanted, found = getattr(cfg.data, field.name), getattr(sequence.reading or cfg.data, field.name)
         if (field.name, wanted) == ("reliability", "ignored"):
@@ -124,6 +137,23 @@ def start_run(
             raise input_error(f"data.{field.name}", repr(wanted), got, "`load_sequence(DATA, config.data)`.")
     if extends and out is not None:
         reject_unextendable(Path(out), cfg, len(sequence))
+    run = _checked_run(sequence, cfg, out, resume=resume, extends=extends, say=say)
+    if not (resume or sequence.is_training_view):  # as `check` does, it looks at all frames
+        for error in find_errors(sequence):
+            say(f"check: {error}")
+    return run
+
+
+def _checked_run(
+    sequence: FrameSequence,
+    cfg: Config,
+    out: str | Path | None,
+    *,
+    resume: bool,
+    extends: bool,
+    say: Callable[[str], None],
+) -> TrainingRun | WindowedRun:
+    """One window, or several."""
     if cfg.windows.longest:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         # Else looked at through a view with a cache of its own, which is freed.
@@ -157,13 +187,6 @@ class TrainingRun:
         reject_too_large(sequence, cfg)
         kernel_cache.fill(cfg, say)
         say(f"{sequence.path}: {len(sequence)} frames; backend {cfg.render.backend}")
-        self.facts: dict[str, int] = {}
-        """What `config.json` says beside what it says of every run."""
-        if cfg.loss.tool_margin == "measured":
-            sequence, margin_px = with_tool_margin(sequence)
-            found = f"tools color {margin_px} px around their masks, which are left out"
-            say(found if margin_px else "tools do not color the pixels around their masks: none is left out")
-            self.facts[MARGIN] = margin_px
         for warning in sequence.validate():
             say(f"note: {warning}")
         self.trainer = method_of(cfg).trainer(sequence, cfg)
@@ -176,12 +199,12 @@ class TrainingRun:
         if self.out is None:
             self.trainer.start()
             self.trainer.run(list(observers))
-            return self.trainer.scene()
+            return with_error_sources(self.trainer.scene(), self.trainer.sequence)
         out, trainer = self.out, self.trainer
         fingerprint = trainer.sequence.fingerprint()
         with held_folder(out, resume=self.resume, begin=lambda: self._begin(out, fingerprint)):
             self._train_in(out, fingerprint, list(observers), checkpoint_seconds)
-            scene = trainer.scene()
+            scene = with_error_sources(trainer.scene(), trainer.sequence)
             scene.save(out / SCENE)
         return scene
 
@@ -203,7 +226,6 @@ class TrainingRun:
             fingerprint,
             resume=self.resume and not restored,  # the checkpoint has been compared
             any_length=self.extends,
-            **self.facts,
         )
         if not restored:
             trainer.start()

@@ -209,6 +209,15 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def read_json_object(path: Path) -> dict[str, Any] | None:
+    """The object in a JSON file of our own that can be made again; None where there is none that can be read."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return stored if isinstance(stored, dict) else None
+
+
 def temporary_sibling(path: Path) -> Path:
     """The hidden path beside `path` that this process writes to: `.STEM.endoprior-MACHINE-PROCESS.partial.SUFFIX`.
 

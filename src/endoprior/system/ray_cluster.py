@@ -25,6 +25,8 @@ SIGNAL_SECONDS = 1.0
 """Longest time after which a signal whose exception was lost is noticed."""
 SAVE_SECONDS = 120.0
 """Longest time that interrupted calls may take to save their state."""
+SET_UP = "endoprior.system.surroundings.set_up_process"
+"""What each process of the cluster calls first, as the command line does."""
 HOST_AND_PORT = re.compile(r"(?:ray://)?\[?([^/\]]+)\]?:(\d+)")
 """An address that names a machine, unlike `auto` and `local`."""
 
@@ -151,7 +153,7 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
             include_dashboard=False,
             logging_level=logging.ERROR,
             job_config=job,
-            runtime_env={"env_vars": wait_policy},
+            runtime_env={"env_vars": wait_policy, "worker_process_setup_hook": SET_UP},
         )
     except (ConnectionError, OSError, ValueError, RuntimeError, SystemExit) as error:
         is_silent = isinstance(error, SystemExit)  # raised by Ray, after minutes, where another program answers

@@ -1,9 +1,13 @@
-"""What surrounds this program: variables, folders and files with which libraries fail, or read what is not ours."""
+"""What surrounds a command: variables, folders and files with which libraries fail, or read what is not ours.
+
+Only the command line and the processes that it starts call this. `import endoprior` changes nothing of its process.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.abc import MetaPathFinder
@@ -20,11 +24,19 @@ MOST_THREADS = 1024
 THREADING_LAYERS = ("default", "safe", "forksafe", "threadsafe", "tbb", "omp", "workqueue")
 
 
-def set_library_variables() -> None:
-    """Set what libraries read when they are imported; a value of the user stays where it can."""
+def set_up_process() -> None:
+    """Set what libraries read when they are imported, and keep them from reading the current folder.
+
+    Call it first in a process, as often as needed. A variable that the user set stays where it can.
+    """
     # Idle torch threads spin on the cores that Numba needs, which makes rendering three times slower (docs/log.md).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ["MPLBACKEND"] = "agg"  # figures are files; Matplotlib fails to import with one that it does not know
+    # How many pixels OpenCV decodes at most (`data.reading.MOST_PIXELS`): what a header says twice, its decoders and
+    # the readers of headers may understand differently.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "64000000")
+    warnings.filterwarnings("ignore", module=r"PIL\.\w+Plugin")  # of damaged tags, which are read as missing
+    _ignore_settings_of_current_folder()
 
 
 def reject_surroundings() -> None:
@@ -53,9 +65,11 @@ NAMES = {"numba.core.config": b"'.numba_config.yaml'", "matplotlib": b"yield 'ma
 
 class _WithoutFile(SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
-        name = NAMES[fullname]
-        source = self.get_data(self.path).replace(name, name.split(b"'")[0] + b"''")
-        return self.source_to_code(source, self.path)
+        name, source = NAMES[fullname], self.get_data(self.path)
+        file = name.split(b"'")[1].decode()
+        if name not in source and os.path.exists(file):  # a release that looks for its file in another way
+            raise input_error(file, "none in the current folder, which would be read", "one", "`cd` to another folder.")
+        return self.source_to_code(source.replace(name, name.split(b"'")[0] + b"''"), self.path)
 
 
 class _Finder(MetaPathFinder):
@@ -70,12 +84,12 @@ class _Finder(MetaPathFinder):
         return spec
 
 
-def ignore_settings_of_current_folder() -> None:
+def _ignore_settings_of_current_folder() -> None:
     """Keep libraries from reading settings in the current folder, which may have come with the data.
 
     Numba loads pickles from the `cache_dir` of `.numba_config.yaml`, and Matplotlib's `matplotlibrc` can start LaTeX.
     Both look in the current folder first, and neither has an option against it. This holds for what is imported from
-    now on, and for Numba if it is imported already. Call it as often as needed.
+    now on, and for Numba if it is imported already.
 
     What Matplotlib has read before stays: then it is the settings of the program that imported it.
     """
@@ -91,11 +105,11 @@ SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def python_command(module: str, *arguments: str) -> list[str]:
-    """The command that runs a module of this program.
+    """The command that runs a module of this program in a process that is set up like this one.
 
     With `-P`, a file in the current folder, which may have come with the data, is not imported in place of a package.
     """
-    return [sys.executable, "-P", "-m", module, *arguments]
+    return [sys.executable, "-P", "-m", "endoprior.system.run_module", module, *arguments]
 
 
 @contextmanager

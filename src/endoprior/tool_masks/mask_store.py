@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..core.checks import InputError
+from ..core.config_io import value_of
+from ..data.found_tools import FrameRow
 from ..data.images import read_tool_mask, save_png
 from ..footage.components import Mask
-from ..system.atomic import whole_file, write_json
+from ..system.atomic import read_json_object, whole_file, write_json
 
 STATE = "state.json"
+TYPES = {"rows": tuple[FrameRow, ...], "confidence": tuple[float, ...], "carried": tuple[str, ...]}
+"""What it holds by name; any other name is a list of `PROMPTS`."""
+PROMPTS = tuple[tuple[int, int, int], ...]
 
 
 class MaskStore(Mapping[int, Mask]):
@@ -55,10 +60,11 @@ class MaskStore(Mapping[int, Mask]):
 
 
 def read_state(folder: Path) -> dict[str, Any]:
-    """What an interrupted run has done; empty before the first."""
+    """What an interrupted run has done; empty before the first, and where the file is damaged: all is done again."""
+    stored = read_json_object(folder / STATE) or {}
     try:
-        return json.loads((folder / STATE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return {name: value_of(TYPES.get(name, PROMPTS), value, name) for name, value in stored.items()}
+    except InputError:
         return {}
 
 

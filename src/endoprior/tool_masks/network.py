@@ -1,4 +1,4 @@
-"""The network that finds tools: a U-Net of a million weights, trained by `tool_training` on composites.
+"""The network that finds tools: a U-Net on a pretrained way down, trained by `tool_training` on composites.
 
 It sees one frame, so it needs neither motion nor a second frame; `h, w` is the size of the image that it gets, whose
 longer side is `LONG_SIDE_PX`. Its weights are a file in the package, checked against its digest; docs/tool_network.md
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -17,7 +18,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn import functional
@@ -29,10 +29,9 @@ from .over_time import Look, decide_over_time
 from .regions import tool_regions
 
 FILE = Path(__file__).with_name("tool_network.safetensors")
-SHA256 = "c49c792f112e198d4a1d206bd207df48166d957f0cd12afebde312d891b96c9c"
+SHA256 = "354f24d519af9bd2c7d48540de993a97c7b66a17e932575d7cdd99939c1d1cde"
 """Of the file; a test compares it with the file and with the model card."""
 LONG_SIDE_PX = 192  # Longer side of the images: a shaft is 15 px wide, a jaw 3
-CHANNELS = (16, 32, 64, 112, 144)  # Channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the size
 INPUTS = 6  # Channels of the image: color, two color ratios, the view
 DARK = 0.04
 """Added to each channel, in [0, 1], before the logarithm: about the noise of dark pixels, which have no color."""
@@ -41,27 +40,55 @@ MATTE = (0.1, 0.85)
 MULTIPLE = 32  # Images are padded to a multiple of this, px
 
 
+@dataclass(frozen=True)
+class Block:
+    """The shape of one block."""
+
+    outputs: int
+    kernel: int
+    stride: int = 1
+    widen: int = 6
+
+
+STEM = 32
+STAGES = (
+    (Block(16, 3, widen=1),),
+    (Block(24, 3, 2), Block(24, 3)),
+    (Block(40, 5, 2), Block(40, 5)),
+    (*(Block(80, 3, 2), Block(80, 3), Block(80, 3)), *(Block(112, 5),) * 3),
+    (Block(192, 5, 2), Block(192, 5)),
+)
+"""The way down, at 1/2, 1/4, 1/8, 1/16 and 1/32 of the size; EfficientNet-Lite0 goes on with 192 and 320 channels."""
+WIDTHS = (24, 32, 48, 72, 192)  # Channels of the way up, at the same sizes
+
+
 class ToolNetwork(nn.Module):
-    """U-Net (Ronneberger et al. 2015) on blocks of 2x2 pixels; each level adds to the log-odds of the coarser ones."""
+    """U-Net (Ronneberger et al. 2015) whose way down is the first blocks of EfficientNet-Lite0 (Tan and Le 2019); each
+    level of the way up adds to the log-odds of the coarser ones.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        ins = (4 * INPUTS, *CHANNELS[:-1])
-        self.down = nn.ModuleList(
-            nn.Sequential(_layer(i, o, 1 if k == 0 else 2), _layer(o, o))
-            for k, (i, o) in enumerate(zip(ins, CHANNELS, strict=True))
-        )
-        self.up = nn.ModuleList(_layer(CHANNELS[k + 1] + CHANNELS[k], CHANNELS[k]) for k in range(len(CHANNELS) - 1))
-        self.out = nn.ModuleList(nn.Conv2d(c, 4 if k == 0 else 1, 3, 1, 1) for k, c in enumerate(CHANNELS))
+        self.stem = _convolution(INPUTS, STEM, 3, stride=2)
+        self.down, inputs = nn.ModuleList(), STEM
+        for blocks in STAGES:
+            stage = nn.Sequential()
+            for block in blocks:
+                stage.append(InvertedResidual(inputs, block))
+                inputs = block.outputs
+            self.down.append(stage)
+        skips = [blocks[-1].outputs for blocks in STAGES]
+        self.up = nn.ModuleList(_convolution(WIDTHS[k + 1] + skips[k], WIDTHS[k], 3) for k in range(len(skips) - 1))
+        self.out = nn.ModuleList(nn.Conv2d(c, 4 if k == 0 else 1, 3, 1, 1) for k, c in enumerate(WIDTHS))
 
     def levels(self, image: Tensor) -> list[Tensor]:
         """Log-odds (n, 1, h / 2^k, w / 2^k) from the coarsest level, k = 5, to the finest, k = 0, of (n, 6, h, w)
         `network_input`; h, w are multiples of `MULTIPLE`.
         """
-        x = functional.pixel_unshuffle(image, 2)
+        x = self.stem(image)
         skips = []
-        for block in self.down:
-            x = block(x)
+        for stage in self.down:
+            x = stage(x)
             skips.append(x)
         found = [self.out[-1](x)]
         for k in reversed(range(len(self.up))):
@@ -76,13 +103,38 @@ class ToolNetwork(nn.Module):
         return self.levels(image)[-1][:, 0]
 
 
+class InvertedResidual(nn.Module):
+    """Widen, filter each channel, narrow (Sandler et al. 2018)."""
+
+    def __init__(self, inputs: int, block: Block) -> None:
+        super().__init__()
+        wide = inputs * block.widen
+        self.expand = _convolution(inputs, wide, 1) if block.widen > 1 else nn.Identity()
+        self.filter = _convolution(wide, wide, block.kernel, stride=block.stride, groups=wide)
+        self.project = nn.Sequential(nn.Conv2d(wide, block.outputs, 1, bias=False), _norm(block.outputs))
+        self.adds = block.stride == 1 and inputs == block.outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, outputs, h / stride, w / stride) of (n, inputs, h, w)."""
+        y = self.project(self.filter(self.expand(x)))
+        return x + y if self.adds else y
+
+
 def _twice(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
-def _layer(inputs: int, outputs: int, stride: int = 1) -> nn.Module:
-    convolution = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
-    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    """Convolution, normalization, ReLU6. With stride 2 the borders are TensorFlow's, as the pretrained weights ask."""
+    before = (kernel - stride) // 2
+    after = kernel - stride - before
+    pad = nn.ZeroPad2d((before, after, before, after))
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups, bias=False)
+    return nn.Sequential(pad, convolution, _norm(outputs), nn.ReLU6(inplace=True))
+
+
+def _norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, eps=1e-3)
 
 
 def network_input(rgb_u8: Image, view: Mask) -> NDArray[np.float32]:
@@ -115,17 +167,6 @@ def shipped_network() -> ToolNetwork:
     return network_from(data)
 
 
-def network_from_file(path: Path) -> ToolNetwork:
-    """A network for inference from a weights file that a user names; InputError if it is none."""
-    fix = "Name a file that `endoprior bench masks --write-weights` wrote."
-    try:
-        return network_from(path.read_bytes())
-    except OSError as error:
-        raise input_error(path, "a weights file", f"{error.strerror}", fix) from None
-    except (SafetensorError, RuntimeError, AttributeError) as error:
-        raise input_error(path, "the weights of a tool network", f"{str(error).splitlines()[0]:.80}", fix) from None
-
-
 def network_from(data: bytes) -> ToolNetwork:
     """A network for inference from the bytes of a weights file."""
     network = ToolNetwork()
@@ -152,13 +193,15 @@ class ToolFinder:
         """Take a network in place of the one that comes with the program."""
         self._network = network or shipped_network()
 
-    def log_odds(self, rgb_u8: Image, view: Mask, mirrored: bool = True) -> NDArray[np.float32]:
-        """(h, w) log-odds of a tool of a frame (H, W, 3) in the view (H, W). `mirrored`: mean over the frame and its
-        three mirror images, which is steadier and takes four times as long.
+    def log_odds(self, rgb_u8: Image, view: Mask, turned: bool = True) -> NDArray[np.float32]:
+        """(h, w) log-odds of a tool of a frame (H, W, 3) in the view (H, W).
+
+        Args:
+            turned: mean over the frame and itself turned by 180 degrees, which is steadier and takes twice as long.
         """
         image = torch.from_numpy(network_image(rgb_u8, view))
         h, w = image.shape[1:]
-        flips = ((), (-1,), (-2,), (-1, -2)) if mirrored else ((),)
+        flips = ((), (-1, -2)) if turned else ((),)
         images = torch.stack([image.flip(flip) for flip in flips])
         images = torch.nn.functional.pad(images, (0, -w % MULTIPLE, 0, -h % MULTIPLE))
         with torch.inference_mode():

@@ -95,6 +95,8 @@ class _Clip:
         self.empty = np.zeros(size[::-1], bool)
         self.sequence, self.work, self.state = sequence, work, read_state(work)
         self.found, self.outside = MaskStore(work / "found", size), MaskStore(work / "outside", size)
+        if len(self.state.get("confidence", ())) != len(sequence):
+            self.state = {}
         self.rounds = [MaskStore(work / f"round{number}", size) for number in range(ROUNDS)]
 
     def find(self, refine: bool, progress: Progress) -> None:

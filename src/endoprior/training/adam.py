@@ -24,6 +24,7 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 from ..compute.simd import LANES, prefetch
 from ..model.hexplane import FRESH, TOUCHED, PlaneGrid
 from ..model.motion import RankOneGradient, UnstoredGradient
@@ -231,7 +232,7 @@ def _constants(epsilon: float) -> tuple[np.float32, np.float32, np.float32]:
     return np.float32(BETA1), np.float32(BETA2), np.float32(epsilon)
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _adam_flat(param, grad, first, second, rate, root_scale, beta1, beta2, epsilon):
     # Update every element; param, grad, first, second (n,) float32, all scalars float32. Inputs are trusted.
     # rate = lr / (1 - beta1**step), root_scale = 1 / sqrt(1 - beta2**step).
@@ -245,7 +246,7 @@ def _adam_flat(param, grad, first, second, rate, root_scale, beta1, beta2, epsil
         param[i] -= rate * m / (np.sqrt(v) * root_scale + epsilon)
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _adam_outer(param, weights, v, first, second, begin, rate, root_scale, beta1, beta2, epsilon):
     # Like `_adam_flat` for a gradient that is a sum of outer products: grad[r, b, c] = sum_k weights[k, b] v[k, r, c].
     # param, first, second (R, B, C); weights (K, B), v (K, R, C) float32. Updates basis functions begin .. begin +
@@ -303,7 +304,7 @@ def _update(i, c, g, values, exp_avg, exp_avg_sq, blend1, beta2, blend2, rate, c
     values[i, c] -= rate * m / (math.sqrt(v) * correction + epsilon)
 
 
-@njit(parallel=True, cache=True, fastmath={"contract", "nsz"})
+@parallel_njit(fastmath={"contract", "nsz"})
 def _step_cells(values, grads, exp_avg, exp_avg_sq, marks, blend1, beta2, blend2, rate, correction, epsilon):
     # Tasks take groups of cells in turn, because touched cells lie in clusters. Cells are independent of each other.
     cells, channels = values.shape
@@ -332,7 +333,7 @@ def count_unusable_in_planes_numba(grid: PlaneGrid, limit: float) -> int:
     return int(_count_rows(grid.grads.numpy(), grid.marks.numpy(), FRESH, np.float32(limit)))
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _count(values, limit):
     bad = 0
     for i in prange(values.size):
@@ -341,7 +342,7 @@ def _count(values, limit):
     return bad
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _count_rows(values, marks, mark, limit):
     bad = 0
     for i in prange(values.shape[0]):

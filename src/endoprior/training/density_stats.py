@@ -16,6 +16,7 @@ from numba import njit, prange
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from ..compute.parallel_kernels import parallel_njit
 from ..core.types import RenderOutput
 from .adam import gradient_of
 
@@ -136,7 +137,7 @@ def valid_projection_numba(means2d: Tensor, radii: Tensor, tissue_mask: Tensor) 
     return torch.from_numpy(found)
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _add_gradient(radii, v_means2d, half_width, half_height, grad2d_ndc_sum, num_seen):
     # Add the norm of the gradient (N, 2) in NDC units, and 1 to `num_seen`, where rendered.
     num = len(radii)
@@ -148,7 +149,7 @@ def _add_gradient(radii, v_means2d, half_width, half_height, grad2d_ndc_sum, num
                 num_seen[n] += _ONE
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _add_score(means2d, radii, scale, prior, tissue_mask, opacities, score_sum, opacity_sum, num_valid):
     # Add the prior (H, W) at `scale * means2d`, the opacity (N,) and 1, where `_is_valid` says so.
     num = len(radii)
@@ -161,7 +162,7 @@ def _add_score(means2d, radii, scale, prior, tissue_mask, opacities, score_sum, 
                 num_valid[n] += _ONE
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _valid(means2d, radii, tissue_mask, found):
     # Write `_is_valid` of every Gaussian to `found` (N,) bool.
     num = len(radii)

@@ -26,9 +26,9 @@ from .density_stats import DensityStats
 from .frames import TrainingFrames
 from .gaussian_trainer import GaussianTrainer
 from .losses import supervised_terms
-from .ops import TrainingOps
+from .ops_interface import TrainingOps
 from .optimizer import Rate, rate_of
-from .step import Drawn
+from .state import Drawn
 from .trainer import Stage, Trainer
 
 EPOCHS = 2**31  # keeps the random numbers of epochs apart from those of iterations

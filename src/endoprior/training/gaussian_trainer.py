@@ -7,7 +7,7 @@ Two stages. Coarse: the first training frame alone, nothing deforms. Fine: a ran
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, cast
 
@@ -35,9 +35,11 @@ from .density_stats import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .missed_tools import VISITS, MaskDoubt
-from .ops import TrainingOps, ops_for
+from .ops import ops_for
+from .ops_interface import TrainingOps
 from .optimizer import Optimizer
 from .photometric import ClearedFrames, smoke_of
+from .state import GaussiansState
 from .step import TrainingStep
 from .tracks import StartTracks
 from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
@@ -56,32 +58,6 @@ def spatial_scale(extent: float, fit_to_clip: bool) -> float:
     if extent <= 1e-3:
         return STILL_CAMERA_SCALE
     return min(extent, STILL_CAMERA_SCALE) if fit_to_clip else extent
-
-
-@dataclass
-class GaussiansState:
-    """All that changes while training; a checkpoint holds exactly this."""
-
-    stage: Stage
-    iteration: int  # iterations of this stage already done
-    gaussians: Gaussians
-    field: Field | None
-    optimizer: Optimizer
-    stats: DensityStats
-    tracks: StartTracks | None  # where motion started from optical flow and is held to it
-    left_out: Tensor | None  # (F, VISITS) share of the view that showed a missed tool in the last visits of each frame
-
-    def arrays(self) -> dict[str, Tensor]:
-        """Every tensor by the name that it has in a checkpoint."""
-        parts = {
-            "gaussians": {name: value.detach() for name, value in self.gaussians.tensors.items()},
-            "stats": self.stats.tensors(),
-            "optimizer": self.optimizer.state_arrays(),
-            "tracks": self.tracks.tensors() if self.tracks else {},
-            "field": self.field.state_arrays() if self.field else {},
-        }
-        arrays = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        return arrays if self.left_out is None else arrays | {"left_out": self.left_out}
 
 
 def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, ArraySpec]:

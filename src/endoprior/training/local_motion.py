@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from ..compute.fastmath import REORDERED
 from ..compute.neighbors import MAX_COORDINATE, nearest
+from ..compute.parallel_kernels import parallel_njit
 from ..core.checks import check_shape
 
 NUM_NEIGHBORS = 8  # K
@@ -164,7 +165,7 @@ class _LocalMotion(torch.autograd.Function):
         return v_now, v_before, None, None, None
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def _weigh_pairs(distances, indices, weights, scale, out):
     # One task per point.
     for i in prange(len(distances)):
@@ -210,7 +211,7 @@ def _pair(now, before, i, j, w, constants):
     return w * displacement, w * penalty, p * dx, p * dy, p * dz, q * ax, q * ay, q * az, r * bx, r * by, r * bz
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED, error_model="numpy")
+@parallel_njit(fastmath=REORDERED, error_model="numpy")
 def _pull(now, before, indices, weights, starts, sources, incoming, constants, grads, sums):
     # One task per run of points. Writes grads[:, i] (displacement, penalty now, penalty before), of the sums that are
     # not yet divided by the sum of weights, and sums[task]: weights, displacement, penalty.

@@ -17,12 +17,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..compute.fastmath import REORDERED
+from ..compute.parallel_kernels import parallel_njit
 from ..core.config import LossConfig
 from ..core.types import RenderOutput
 from .frames import TrainingFrame
 
 if TYPE_CHECKING:
-    from .ops import TrainingOps
+    from .ops_interface import TrainingOps
 
 BAND = 16  # rows per task
 MIN_DEPTH_PIXELS = 10  # a frame with fewer pixels of measured tissue depth gets no depth loss
@@ -184,7 +185,7 @@ class _SupervisedLosses(torch.autograd.Function):
         return *ctx.grads, None, None, None, None, None, None
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _invert(depth, inverse):
     for y in prange(depth.shape[0]):
         for x in range(depth.shape[1]):
@@ -197,7 +198,7 @@ def _sign(x):
     return np.float32(x > 0) - np.float32(x < 0)
 
 
-@njit(parallel=True, cache=True, fastmath=REORDERED)
+@parallel_njit(fastmath=REORDERED)
 def _bands(
     color, depth, target_u8, target_inverse, tissue_mask, measured, tv_on_tissue, inverse, factors,
     v_color, v_depth, sums,

@@ -116,7 +116,7 @@ class MaskDoubt:
 
     def _surely_tissue(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_]:
         """(h, w) True where the tool network is sure of tissue; `size` is (w, h)."""
-        log_odds = self._finder.log_odds(self._sequence.frame(index).rgb_u8, self._view, mirrored=False)
+        log_odds = self._finder.log_odds(self._sequence.frame(index).rgb_u8, self._view, turned=False)
         return _resized(log_odds, size) < SURELY_TISSUE
 
 

@@ -17,7 +17,7 @@ from ..model.motion import Field, RankOneGradient, UnstoredGradient
 from ..system.arrays_file import part
 from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import LARGEST_GRADIENT
-from .ops import TrainingOps
+from .ops_interface import TrainingOps
 
 Rate = Callable[[int], float]  # learning rate at an iteration (1-based, within the stage)
 PLANES = "planes"  # name of the planes of a field, among the names of parameters

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,57 +15,28 @@ from torch import Tensor
 
 from ..core.checks import input_error
 from ..core.config import Config
-from ..core.types import Camera, RenderOutput, Splats
-from ..model.gaussians import Gaussians
+from ..core.types import Camera
 from ..model.hexplane_field import HexPlaneField
-from ..model.motion import Field, Motion, Offsets
+from ..model.motion import Motion
 from ..model.photometric import filmed
 from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
-from .frames import TrainingFrame, TrainingFrames
+from .frames import TrainingFrames
 from .losses import color_l1
 from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
-from .ops import TrainingOps
+from .ops_interface import TrainingOps
+from .state import Before, Drawn, GaussiansState
 from .temporal import temporal_terms
 from .trainer import Stage, StepReport, stage_length
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
-    from .gaussian_trainer import GaussiansState
 
 RESET_OPACITY = 0.01  # where methods that reset opacities lower them to (3DGS)
 MAX_SCALE_SHARE = 0.016
 """Largest canonical scale as a share of the distance to the camera: larger ones are fog when the model is turned, much
 smaller ones leave holes beside silhouettes."""
-
-
-class Before(NamedTuple):
-    """The training frame just before, with which the temporal term compares."""
-
-    frame: TrainingFrame
-    tissue_mask_now: Tensor  # (H, W) bool of the rendered frame: True at a tool that the masks miss, too
-    means: Tensor | None  # (N, 3) centers at the frame before, mm, where they are known already
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A training frame that was rendered, and what it was rendered from: what the loss of a method sees."""
-
-    stage: Stage
-    iteration: int  # 1-based, within the stage
-    position: int  # place of the frame among the training frames
-    frame: TrainingFrame  # what is compared: without the pixels that show a tool in spite of the mask
-    gaussians: Gaussians
-    field: Field | None
-    offsets: Offsets | None  # what moved them; None in the coarse stage
-    splats: Splats  # the Gaussians as they were rendered
-    out: RenderOutput
-    render: Callable[[Splats], RenderOutput]  # other Gaussians from the same camera
-    context: Any  # what the method's `context` made of all training frames
-    before: Before | None = None  # the frame before, where the temporal term takes part
-    is_right: bool = False  # of the right eye: only its image and depth are compared
-    left_out: float | None = None  # share of the view that shows a missed tool; None where that was not asked
 
 
 @dataclass

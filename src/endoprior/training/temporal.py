@@ -21,8 +21,8 @@ from .frames import TrainingFrame
 from .local_motion import NUM_NEIGHBORS
 
 if TYPE_CHECKING:
-    from .ops import TrainingOps
-    from .step import Before, Drawn
+    from .ops_interface import TrainingOps
+    from .state import Before, Drawn
 
 DISPLACEMENT_WEIGHT, DISTANCE_WEIGHT = 1.0, 0.2  # lambda_disp and lambda_dist
 MOTION_THRESHOLD, MOTION_TEMPERATURE = 0.45, 0.08  # tau_m and gamma_m of Eq. (9)

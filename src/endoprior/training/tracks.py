@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..compute.parallel_kernels import parallel_njit
 from ..core.types import Camera
 from ..initialization.motion_fit import InitialMotion
 from ..model.basis import spline_weights
@@ -114,7 +115,7 @@ class _TrackTerm(torch.autograd.Function):
         return v_term * ctx.v_offsets, None, None, None, None
 
 
-@njit(parallel=True, cache=True)
+@parallel_njit()
 def _track_kernel(means, offsets, displacement, followed, rows, view_z, scale, share, v_offsets, sums):
     # One task per CHUNK Gaussians: writes v_offsets (N, 3), `share` times the gradient, and one sum of penalties.
     # displacement (P, 3) and followed (P,) are those of the frame; `view_z` (4,) turns a point into its camera z.

@@ -11,13 +11,14 @@ import hmac
 import ipaddress
 import logging
 import math
+import re
 import socket
 import threading
 import time as clock
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
@@ -51,9 +52,14 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 """Headers of every response."""
-WRONG_HOST = "Expected localhost, an IP address or the name of this machine in the address of the viewer.\n"
+HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
+WRONG_HOST = (
+    "Expected localhost, an IP address or the name of this machine in the address of the viewer. "
+    "Behind a proxy with another name: `endoprior view RUN --allow-host NAME`.\n"
+)
 WRONG_TOKEN = "Expected the address that endoprior printed when the viewer started: it has a token.\n"
 Job = Callable[[], object]
+Names = Collection[str]
 Accepts = Callable[[str, Any], bool]
 """Whether the control with this id can have this value."""
 
@@ -79,16 +85,43 @@ def is_open(host: str) -> bool:
     return not all(ipaddress.ip_address(found[4][0]).is_loopback for found in socket.getaddrinfo(host, None))
 
 
-def is_known_host(asked: str, host: str) -> bool:
-    """Whether a `Host` header names this machine: by an IP address, as localhost, by its own name or by `host`.
+def is_known_host(asked: str, host: str, allowed: Names = ()) -> bool:
+    """Whether a `Host` header names this machine: by an IP address, as localhost, by a name of its own, by `host`, or
+    by a name that the user has `allowed`.
 
     Any other name was made to point here by somebody else (DNS rebinding).
     """
     try:
-        name = urlsplit(f"//{asked}").hostname or ""
-        return name in ("localhost", socket.gethostname().lower(), host.lower()) or bool(ipaddress.ip_address(name))
+        name = (urlsplit(f"//{asked}").hostname or "").removesuffix(".")
+        given = {each.lower().removesuffix(".") for each in ("localhost", host, *allowed)} - {""}
+        return name in given or name in names_of_machine() or bool(ipaddress.ip_address(name))
     except ValueError:
         return False
+
+
+@cache
+def names_of_machine() -> frozenset[str]:
+    """Names that this machine gives itself, in lower case: short, in full, and on its local network.
+
+    The full one may ask a name server, once, and take some seconds.
+    """
+    own = socket.gethostname()
+    found = [own, socket.getfqdn()]
+    with suppress(OSError):  # one without an address
+        name, others, _ = socket.gethostbyaddr(own)
+        found += [name, *others]
+    names = {name.lower().removesuffix(".") for name in found} - {""}
+    short = own.lower().partition(".")[0]
+    return frozenset(names | ({short, f"{short}.local"} if short else set()))
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Raise InputError unless `--allow-host` has names of hosts alone: no address of a page, no port, no pattern."""
+    for name in names:
+        if not HOST_NAME.fullmatch(name):
+            found = re.search(r"[A-Za-z0-9][A-Za-z0-9-]*(\.[A-Za-z0-9-]+)+", name)
+            fix = f"`--allow-host {found[0] if found and '*' not in name else 'NAME'}`."
+            raise input_error("--allow-host", "the name of a host, such as viewer.example.org", repr(name), fix)
 
 
 class RateLimit:
@@ -156,12 +189,13 @@ class _LimitedConnection(web_server.ServerConnection):
 
 
 @contextmanager
-def access_control(token: str, host: str, accepts: Accepts) -> Iterator[None]:
+def access_control(token: str, host: str, accepts: Accepts, allowed: Names = ()) -> Iterator[None]:
     """Start the viser server within this context, to guard all of its pages and connections.
 
     Args:
         token: the path of the page, a secret.
         host: address that the server listens on.
+        allowed: other names in the address of the page, such as that of a proxy.
     Raises:
         RuntimeError: viser started no web server of `websockets`, so that nothing is guarded.
     """
@@ -175,7 +209,7 @@ def access_control(token: str, host: str, accepts: Accepts) -> Iterator[None]:
         def answer(connection: web_server.ServerConnection, request: Request) -> Response | None:
             path, hosts = request.path, request.headers.get_all("Host")
             given = path.partition("?")[0].strip("/").encode(errors="replace")
-            if len(hosts) != 1 or not is_known_host(hosts[0], host):
+            if len(hosts) != 1 or not is_known_host(hosts[0], host, allowed):
                 response = connection.respond(HTTPStatus.FORBIDDEN, WRONG_HOST)
             elif not hmac.compare_digest(given, token.encode()):
                 response = connection.respond(HTTPStatus.FORBIDDEN, WRONG_TOKEN)

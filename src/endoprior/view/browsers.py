@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
+from ..export.formats import Progress
 from .layers import Lines, draw_lines
 from .viewable import IDLE_SECONDS, ViewSettings, shrink_factor
 from .viewport import Viewport, bounded_aspect, endoscope_viewport, free_viewport
@@ -17,7 +20,7 @@ from .viewport import Viewport, bounded_aspect, endoscope_viewport, free_viewpor
 if TYPE_CHECKING:
     import viser
 
-    from .viewable import Viewable
+    from .viewables import Viewable
 
 PREVIEW_QUALITY = 80
 """JPEG quality of images while something moves; static images are PNG (lossless)."""
@@ -52,6 +55,22 @@ class Browsers:
         """Show a notification in every browser for a few seconds."""
         for browser in self._connected():
             browser.client.add_notification(title, body, auto_close_seconds=5.0)
+
+    @contextmanager
+    def progress(self, title: str) -> Iterator[Progress]:
+        """Show in every browser how much of something long is done, until it ends: images stand still meanwhile."""
+        clients = [browser.client for browser in self._connected()]
+        shown = [each.add_notification(title, "", loading=True, with_close_button=False) for each in clients]
+
+        def progress(done: int, total: int) -> None:
+            for notification in shown:
+                notification.body = f"{done} of {total}"
+
+        try:
+            yield progress
+        finally:
+            for notification in shown:
+                notification.remove()
 
     def _connected(self) -> list[_Browser]:
         """Browsers that are still connected; `leave` may not have been called yet."""
@@ -101,7 +120,8 @@ class Browsers:
             if viewport is None:
                 continue
             camera, shown = viewport.camera, browser.shown
-            wanted = content, camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), viewport.width
+            canvas = viewport.width, viewport.height
+            wanted = content, camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), canvas
             # After a preview, send the full image once nothing moves.
             if shown is not None and shown[0] == wanted and (preview or not shown[1]):
                 continue

@@ -7,7 +7,7 @@ beyond the farthest distance that browsers render, is such an object: always und
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
 
 import cv2
 import numpy as np
@@ -25,7 +25,6 @@ from .access_control import BRUSH_NODE, JobQueue
 if TYPE_CHECKING:
     import viser
 
-    from .panel import Panel
 
 MOST_UNDO = 100
 """Number of steps that can be undone."""
@@ -160,13 +159,22 @@ Spot = tuple[int, tuple[float, float]]
 """A frame, and a position in its mask, px."""
 
 
+class BrushControls(Protocol):
+    """The controls of the panel that the editor reads, and the text in which it reports."""
+
+    find: viser.GuiCheckboxHandle
+    erase: viser.GuiCheckboxHandle
+    radius: viser.GuiSliderHandle
+    corrected: viser.GuiMarkdownHandle
+
+
 class MaskEditor:
     """Corrects tool masks while the panel says so. All methods but the callbacks run in the thread of `Viewer.work`."""
 
     def __init__(
         self,
         edits: MaskEdits,
-        controls: Panel,
+        controls: BrushControls,
         scene: viser.SceneApi,
         jobs: JobQueue,
         spot: Callable[[viser.ClientHandle, tuple[float, float]], Spot | None],

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.geometry import back_project, length_unit
 from ..core.types import Camera
-from ..model.carry import CarriedPoints
 from ..model.measures import Measures, measures_of
+from ..model.uncertainty import PointErrors
 from ..visualization.measures import measures_csv
 from .layers import NO_LINES, TRAIL_FRAMES, Lines, ruler, track_lines
 from .panel import AREA, DISPLACEMENT, DISTANCE, PATH, POINTS_OF, STRETCH, Panel
-from .viewable import ViewSettings
+from .viewable import FollowedPoints, ViewSettings
 
 if TYPE_CHECKING:
-    from .viewable import Viewable
+    from .viewables import Viewable
 
 SURE = 0.5
 """Least confidence of a track that is not drawn faded."""
@@ -51,6 +51,8 @@ class Measurement:
     """(T, K) of the surface around the points since frame `since`; None: not computed."""
     since: int = 0
     """Reference frame of displacement and stretch."""
+    errors: PointErrors | None = None
+    """Of the points; None: not known."""
 
     def ends(self, frame: int, quantity: str = DISTANCE) -> NDArray[np.float64]:
         """The points in `frame`, (K, 3), to draw a line through, closed for an area; (0, 3) where they are unknown."""
@@ -62,7 +64,8 @@ class Measurement:
     @cached_property
     def measures(self) -> Measures:
         unknown = np.full(self.paths.shape[:2], np.nan)
-        return measures_of(self.paths, unknown if self.stretch is None else self.stretch, self.since, self.frame)
+        stretch = unknown if self.stretch is None else self.stretch
+        return measures_of(self.paths, stretch, self.since, self.frame, self.errors)
 
     def curve(self, quantity: str) -> NDArray[np.float64]:
         """(T,) a quantity of `POINTS_OF` in each frame, of the last point if it is one of single points."""
@@ -71,6 +74,13 @@ class Measurement:
         if quantity in of_points:
             return of_points[quantity][:, -1]
         return found.area if quantity == AREA else found.distance
+
+    def ranges(self, quantity: str) -> NDArray[np.float64]:
+        """(T,) half of the range that holds 95 % of the true values of the same; NaN where that is not known."""
+        of = self.measures.ranges
+        if of is None or quantity not in (DISTANCE, AREA, DISPLACEMENT):
+            return np.full(len(self.paths), np.nan)
+        return {DISTANCE: of.distance, AREA: of.area, DISPLACEMENT: of.displacement[:, -1]}[quantity]
 
 
 def measurement_text(measured: Measurement | None, frame: int, relative: bool, quantity: str = DISTANCE) -> str:
@@ -90,7 +100,9 @@ def measurement_text(measured: Measurement | None, frame: int, relative: bool, q
     unit = length_unit(relative)
     unit = {STRETCH: "", AREA: f" {unit}²"}.get(quantity, f" {unit}")
     digits = 3 if quantity == STRETCH else 2
-    text = f"**{values[frame]:.{digits}f}{unit}**"
+    half = measured.ranges(quantity)[frame]
+    either = f" ± {half:.{digits}f}" if np.isfinite(half) else ""
+    text = f"**{values[frame]:.{digits}f}{either}{unit}**" + (" in 95 %" if either else "")
     if quantity == PATH:
         return text + f"  \nsince frame 0; {measured.measures.path_length_raw[frame, -1]:.2f} without smoothing"
     since = measured.since if of_one else measured.frame
@@ -131,7 +143,7 @@ class Measuring:
         paths = followed.positions.astype(np.float64)
         with_stretch = everything or self._panel.quantity.value == STRETCH
         stretch = viewable.stretch(paths[since], since) if with_stretch else None
-        self.measured = Measurement(frames[-1], paths, stretch, since)
+        self.measured = Measurement(frames[-1], paths, stretch, since, followed.errors)
         return followed.confidence
 
     def table(self, viewable: Viewable, settings: ViewSettings) -> str | None:
@@ -163,7 +175,11 @@ class Measuring:
         shown = self.measured or controls.measure.value
         text = measurement_text(self.measured, frame, viewable.relative, quantity) if shown else ""
         controls.distance.content = text
-        controls.show_curve(self.measured.curve(quantity) if self.measured else np.zeros(0))
+        unknown = np.zeros(0)
+        curve, ranges = (
+            (self.measured.curve(quantity), self.measured.ranges(quantity)) if self.measured else (unknown, unknown)
+        )
+        controls.show_curve(curve, ranges)
 
 
 class DrawnTracks:
@@ -171,11 +187,11 @@ class DrawnTracks:
 
     def __init__(self, viewable: Viewable) -> None:
         self._viewable = viewable
-        self.picked: list[CarriedPoints] = []
+        self.picked: list[FollowedPoints] = []
         """One point each."""
 
     @cached_property
-    def _grid(self) -> CarriedPoints:
+    def _grid(self) -> FollowedPoints:
         return self._viewable.tracks()
 
     def pick(self, point: NDArray, frame: int) -> None:
@@ -190,7 +206,7 @@ class DrawnTracks:
         lines = self._lines_of([self._grid], frame) if with_grid else NO_LINES
         return lines + self._lines_of(self.picked, frame)
 
-    def _lines_of(self, points: list[CarriedPoints], frame: int) -> Lines:
+    def _lines_of(self, points: list[FollowedPoints], frame: int) -> Lines:
         if not any(each.positions.size for each in points):
             return NO_LINES
         positions = np.concatenate([each.positions for each in points], 1)

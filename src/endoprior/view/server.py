@@ -15,8 +15,9 @@ import tempfile
 import time as clock
 import traceback
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,8 +34,9 @@ from ..system.atomic import whole_file
 from ..system.console import complain
 from ..visualization.video import write_video
 from . import panel
-from .access_control import Job, JobQueue, RateLimit, access_control, check_address
+from .access_control import Job, JobQueue, Names, RateLimit, access_control, check_address
 from .browsers import Browsers, camera_pose, picture_with_lines, viewport_of
+from .exports import SCENE_FILES, scene_file
 from .layers import Lines
 from .mask_editor import MaskEditor, Spot
 from .measure import DrawnTracks, Measuring, pick
@@ -42,7 +44,7 @@ from .viewable import IDLE_SECONDS, ViewSettings, frame_due
 from .viewport import PathPoint, Viewport, endoscope_viewport, follow_frames, interpolate
 
 if TYPE_CHECKING:
-    from .viewable import Viewable
+    from .viewables import Viewable
 
 MAX_KEPT = 100
 """Largest number of saved views."""
@@ -62,13 +64,15 @@ class _LocalServer(viser.ViserServer):
 class Viewer:
     """A web page that shows a scene or a sequence. Call `work` repeatedly, or `run`."""
 
-    def __init__(self, viewable: Viewable, *, host: str = "127.0.0.1", port: int = 0, out: Path | None = None) -> None:
+    def __init__(
+        self, viewable: Viewable, *, host: str = "127.0.0.1", port: int = 0, out: Path | None = None, names: Names = ()
+    ) -> None:
         """Start listening.
 
         Args:
             host: address to listen on; other machines can connect to any but the loopback address.
-            port: 0 uses any free port.
-            out: folder to store screenshots and videos, in addition to the download; None stores none.
+            port: 0 uses any free port. names: others of this machine in the address of the page, as that of a proxy.
+            out: folder to store what is saved, in addition to the download; None stores none.
         Raises:
             InputError: the address cannot be used.
         """
@@ -80,7 +84,7 @@ class Viewer:
         self._playing: tuple[int, float] | None = None  # frame and time at the start of playback
         self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
         self._token = secrets.token_urlsafe(24)
-        with contextlib.redirect_stdout(io.StringIO()), access_control(self._token, host, self._accepts):
+        with contextlib.redirect_stdout(io.StringIO()), access_control(self._token, host, self._accepts, names):
             self.server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)  # prints a banner
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
@@ -165,23 +169,14 @@ class Viewer:
     # Callbacks of the controls.
 
     def _listen(self) -> None:
-        controls, ask = self.panel, self.jobs.put
+        controls, ask, on_press, on_choice = self.panel, self.jobs.put, self._on_press, self._on_choice
 
         def on_change(job: Job, *handles: Any) -> None:
             for handle in handles:  # values set by the viewer itself arrive without a client
                 handle.on_update(lambda event: ask(job, job) if event.client is not None else None)
 
-        def on_press(job: ClientJob, handle: viser.GuiButtonHandle, key: object = None) -> None:
-            def pressed(event: viser.GuiEvent) -> None:
-                if (client := event.client) is not None:
-                    ask(lambda: job(client), key)
-
-            handle.on_click(pressed)
-
         def on_save(job: ClientJob, handle: viser.GuiButtonHandle) -> None:
-            """Save at most once per second, and let one press wait: more would fill the disk."""
-            rate = RateLimit(1)
-            on_press(lambda client: rate.exceeded(clock.monotonic()) or job(client), handle, job)
+            on_press(limited(job), handle, job)
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
         on_change(self.read_panel, controls.layer, controls.camera, controls.riding, controls.rendered_by)
@@ -190,20 +185,36 @@ class Viewer:
         on_change(self._restart_clock, controls.speed)
         on_change(self.read_clicking, controls.measure, controls.follow, controls.quantity)
         on_press(lambda _client: self._toggle_play(), controls.play)
-        on_press(lambda _client: self._then_update(self.measuring.clear), controls.clear)
+        cleared = partial(self._then_update, self.measuring.clear)
+        on_choice({panel.CLEAR: lambda _client: cleared(), panel.TABLE: limited(self._save_table)}, controls.points)
         on_press(lambda _client: self.tracks.clear(), controls.clear_tracks)
         on_press(self._keep_view, controls.keep)
         on_press(lambda _client: self._then_update(self.kept_views.clear), controls.forget)
-        on_save(self._save_table, controls.table)
         on_save(lambda _client: self.measuring.save_scale(self.viewable), controls.save_scale)
-        on_save(self._screenshot, controls.screenshot)
-        on_save(self._save_video, controls.video)
+        views = {panel.IMAGE: limited(self._save_image), panel.VIDEO: limited(self._save_video)}
+        on_choice(views, controls.save_view)
+        on_choice({name: limited(partial(self._save_scene, name)) for name in SCENE_FILES}, controls.save_scene)
         if editor := self._editor:
             on_press(lambda _client: editor.undo(), controls.undo)
             on_press(lambda _client: editor.carry(self.settings.frame), controls.carry)
             on_save(lambda _client: editor.save(), controls.save_masks)
         self.server.on_client_connect(lambda client: ask(lambda: self._welcome(client), surely=True))
         self.server.on_client_disconnect(self._goodbye)
+
+    def _on_press(self, job: ClientJob, handle: viser.GuiButtonHandle, key: object = None) -> None:
+        def pressed(event: viser.GuiEvent) -> None:
+            if (client := event.client) is not None:
+                self.jobs.put(lambda: job(client), key)
+
+        handle.on_click(pressed)
+
+    def _on_choice(self, jobs: Mapping[str, ClientJob], handle: viser.GuiButtonGroupHandle) -> None:
+        async def pressed(event: viser.GuiEvent) -> None:  # async: before the next press changes the value
+            name = handle.value
+            if (client := event.client) is not None:
+                self.jobs.put(lambda: jobs[name](client), name)
+
+        handle.on_click(pressed)
 
     async def _goodbye(self, client: viser.ClientHandle) -> None:  # async: viser's threads may have ended
         self.jobs.put(lambda: self._browsers.leave(client), surely=True)
@@ -332,7 +343,7 @@ class Viewer:
             self.kept_views.append(PathPoint(self.settings.frame, viewport.camera))
         self._update_panel()
 
-    def _screenshot(self, client: viser.ClientHandle) -> None:
+    def _save_image(self, client: viser.ClientHandle) -> None:
         if (viewport := self._viewport(client)) is not None:
             picture = encode_png(self._picture(self.settings, viewport.camera))
             self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", picture)
@@ -351,10 +362,22 @@ class Viewer:
         if len(places) > MAX_PICTURES:
             self._browsers.notify("No video", f"Expected at most {MAX_PICTURES} images, got {len(places)}.")
             return
-        self._browsers.notify("Rendering the video", f"{len(places)} images")
-        # One at a time: all together may not fit into memory.
-        pictures = (self._picture(replace(settings, frame=place.frame), place.camera) for place in places)
-        self._offer(client, f"{settings.layer}.mp4", mp4_bytes(pictures, self.viewable.frames_per_second))
+        with self._browsers.progress("Rendering the video") as progress:
+
+            def pictures() -> Iterator[NDArray[np.uint8]]:  # one at a time: all together may not fit into memory
+                for k, place in enumerate(places):
+                    yield self._picture(replace(settings, frame=place.frame), place.camera)
+                    progress(k + 1, len(places))
+
+            content = mp4_bytes(pictures(), self.viewable.frames_per_second)
+        self._offer(client, f"{settings.layer}.mp4", content)
+
+    def _save_scene(self, button: str, client: viser.ClientHandle) -> None:
+        if (scene := self.viewable.scene) is None:
+            return
+        with self._browsers.progress(f"Writing the model: {button}") as progress:
+            name, content = scene_file(scene, button, self.settings.frame, progress)
+        self._offer(client, name, content)
 
     def _save_table(self, client: viser.ClientHandle) -> None:
         table = self.measuring.table(self.viewable, self.settings)
@@ -368,6 +391,12 @@ class Viewer:
         client.send_file_download(name, content)
         if self.out is not None:
             self._browsers.notify("Saved", str(keep(self.out, name, content)))
+
+
+def limited(job: ClientJob) -> ClientJob:
+    """`job`, at most once per second: more would fill the disk."""
+    rate = RateLimit(1)
+    return lambda client: rate.exceeded(clock.monotonic()) or job(client)
 
 
 def mp4_bytes(pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> bytes:

@@ -1,18 +1,14 @@
-"""What the viewer shows, a trained scene or a raw sequence, and the settings of the view."""
+"""The settings of the view, and what the viewer gets of a trained scene or a raw sequence."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from .viewable_scene import ViewableScene
-    from .viewable_sequence import ViewableSequence
-
-    Viewable = ViewableScene | ViewableSequence
+from ..model.uncertainty import PointErrors
 
 Layer = Literal["color", "depth", "alpha", "displacement", "stretch", "prior", "support", "frame", "difference"]
 """`color`, `depth` and `alpha` as rendered; `displacement` and `stretch` since a reference frame; `prior` the
@@ -23,6 +19,21 @@ SLOW_MS = 60.0
 """If rendering at full size takes longer, images are rendered at half size while something moves."""
 IDLE_SECONDS = 0.25
 """After this time without motion, the image is rendered again at full size."""
+
+
+@dataclass(frozen=True)
+class FollowedPoints:
+    """Points in every frame."""
+
+    positions: NDArray[np.floating]
+    """(T, K, 3) world axes, mm; NaN where unknown."""
+    errors: PointErrors | None = None
+    """How far they may be from the truth; None: they are the truth."""
+
+    @property
+    def confidence(self) -> NDArray[np.float32]:
+        """(T, K) in where they are, in [0, 1]."""
+        return np.ones(self.positions.shape[:2], np.float32) if self.errors is None else self.errors.confidence
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from .. import render
 from ..core.geometry import back_project, expected_depth, length_unit, project, quaternion_to_matrix
 from ..core.types import Camera, RenderOutput, Splats
 from ..data import FrameSequence
-from ..model.carry import CarriedPoints, carry, centers_then
+from ..model.carry import carry, centers_then
 from ..model.colors import FEW_ITERATIONS, one_color
 from ..model.gaussians import SH_C0, with_colors
 from ..model.measures import SurfaceMotion, distance
@@ -23,11 +23,12 @@ from ..model.photometric import behind_smoke
 from ..model.playback import Playback
 from ..model.scene import Scene
 from ..model.surface import Support, Surface, project_visible, shown_pixels
+from ..model.uncertainty import point_errors
 from ..visualization.image_tools import SOLID_ALPHA, colorize, gray, to_u8
 from ..visualization.measures import displacement_span, stretch_span, value_colors
 from ..visualization.rendered_views import depth_span
 from . import layers
-from .viewable import Cloud, Layer, ViewSettings
+from .viewable import Cloud, FollowedPoints, Layer, ViewSettings
 from .viewport import shrunk_camera
 
 VALUE_LAYERS = ("displacement", "stretch", "prior", "support")
@@ -202,10 +203,11 @@ class ViewableScene:
         """(T, K) largest principal stretch since a frame, around points (K, 3) of that frame; NaN where unknown."""
         return self._surface_motion(since).stretch(points, list(range(len(self.cameras))))
 
-    def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
+    def follow(self, points: NDArray, frames: list[int]) -> FollowedPoints:
         """Points (K, 3), each picked in its frame of `frames`, in every frame; NaN where unknown."""
-        times = [i / len(self.cameras) for i in range(len(self.cameras))]
-        return carry(self.scene, np.asarray(points), np.array(frames, np.intp), times)
+        times, own = [i / len(self.cameras) for i in range(len(self.cameras))], np.array(frames, np.intp)
+        carried = carry(self.scene, np.asarray(points), own, times)
+        return FollowedPoints(carried.positions, point_errors(self.scene, carried, own, range(len(times))))
 
     def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
         """(P,) whether the endoscope's image of a frame shows points (P, 3): neither tissue nor tool hides them."""
@@ -220,7 +222,7 @@ class ViewableScene:
         surface = Surface(depth, np.zeros((*depth.shape, 3), np.float32), small)
         return surface, None if self.sequence is None else layers.fitted(self.sequence.frame(frame).tissue_mask, camera)
 
-    def tracks(self) -> CarriedPoints:
+    def tracks(self) -> FollowedPoints:
         """Tracks of material points: a grid on the surface of the first frame, off the tool; there may be none."""
         camera = self.cameras[0]
         depth = self.surface(ViewSettings(), camera)

@@ -13,12 +13,11 @@ from ..core.types import Camera
 from ..data import FrameSequence
 from ..data.known_length import scale_between
 from ..data.scale_files import write_scale
-from ..model.carry import CarriedPoints
 from ..priors import joint_texture_prior
 from ..visualization.image_tools import colorize
 from . import layers
 from .mask_editor import MaskEdits
-from .viewable import Cloud, Layer, ViewSettings
+from .viewable import Cloud, FollowedPoints, Layer, ViewSettings
 
 MAX_POINTS = 100_000
 """Largest number of points sent to a browser per frame; larger images are subsampled."""
@@ -30,6 +29,8 @@ class ViewableSequence:
 
     layers: tuple[Layer, ...] = ("frame", "depth", "prior")
     has_tool, has_smoke = True, False
+    scene = None
+    """There is none before training."""
 
     def __init__(self, sequence: FrameSequence) -> None:
         self.sequence, self.title = sequence, str(sequence.path)
@@ -117,30 +118,26 @@ class ViewableSequence:
         """Unknown before training."""
         return np.full((len(self.cameras), len(points)), np.nan)
 
-    def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
+    def follow(self, points: NDArray, frames: list[int]) -> FollowedPoints:
         """A point is known only in the frame in which it was picked."""
         paths = np.full((len(self.cameras), *np.shape(points)), np.nan)
         paths[frames, range(len(frames))] = points
-        return _certain(paths)
+        return FollowedPoints(paths)
 
     def shows(self, points: NDArray, _frame: int) -> NDArray[np.bool_]:
         """Where points are known, they are seen."""
         return np.isfinite(points.sum(-1))
 
-    def tracks(self) -> CarriedPoints:
+    def tracks(self) -> FollowedPoints:
         """The tracks of the ground truth, if there are any."""
         tracks = self.sequence.truth.tracks if self.sequence.truth else None
         if tracks is None or not tracks.paired:
-            return _certain(np.zeros((len(self.cameras), 0, 3)))
+            return FollowedPoints(np.zeros((len(self.cameras), 0, 3)))
         poses = camera_to_world(self.cameras)
         world = np.einsum("tij,tpj->tpi", poses[:, :3, :3], tracks.points) + poses[:, None, :3, 3]
-        return _certain(np.where(tracks.visible[..., None], world, np.nan))
+        return FollowedPoints(np.where(tracks.visible[..., None], world, np.nan))
 
     def legend(self, settings: ViewSettings) -> str:
         """Meaning of the colors in one line; empty for plain color."""
         depth = "blue {:.1f} to red {:.1f} {}".format(*self.span, length_unit(self.relative))
         return {"depth": depth, "prior": "joint texture prior: blue 0 to red 1"}.get(settings.layer, "")
-
-
-def _certain(paths: NDArray) -> CarriedPoints:
-    return CarriedPoints(paths, np.ones(paths.shape[:2], np.float32))

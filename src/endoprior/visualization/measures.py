@@ -53,6 +53,7 @@ def measures_csv(found: Measures, frames_per_second: float, unit: str, confidenc
         confidence: (T, P) of the tracks; adds a column for each point.
     """
     total, num_points = found.displacement.shape
+    ranges = found.ranges
     columns: dict[str, Iterable] = {
         "frame": range(total),
         "time": [f"{i / total:.6f}" for i in range(total)],
@@ -61,12 +62,17 @@ def measures_csv(found: Measures, frames_per_second: float, unit: str, confidenc
     name = unit.rstrip(".")
     if num_points > 1:
         columns[f"distance_{name}"] = _texts(found.distance)
+        if ranges:
+            columns[f"distance_range95_{name}"] = _texts(ranges.distance)
     if num_points > 2:
         columns[f"area_{name}2"] = _texts(found.area)
+        if ranges:
+            columns[f"area_range95_{name}2"] = _texts(ranges.area)
     of_points = {
         f"path_{{}}_{name}": found.path_length,
         f"path_raw_{{}}_{name}": found.path_length_raw,
         f"displacement_{{}}_{name}": found.displacement,
+        **({f"displacement_range95_{{}}_{name}": ranges.displacement} if ranges else {}),
         "stretch_{}": found.stretch,
     } | ({} if confidence is None else {"confidence_{}": confidence})
     for p in range(num_points):
@@ -136,9 +142,12 @@ def write_figure(
 def _show_curves(axes: NDArray, found: Measures, frames_per_second: float, unit: str) -> None:
     """Every measure over time, in seconds; points in the colors of the image."""
     seconds = np.arange(len(found.displacement)) / frames_per_second
-    _plot(axes[0], f"distance of points 0 and 1, {unit}", seconds, found.distance[:, None], "black")
-    _plot(axes[1], f"area of the polygon, {unit}²", seconds, found.area[:, None], "black")
-    _plot(axes[3], f"displacement since frame {found.since}, {unit}", seconds, found.displacement)
+    of = found.ranges
+    distance, area = (of.distance[:, None], of.area[:, None]) if of else (None, None)
+    _plot(axes[0], f"distance of points 0 and 1, {unit}", seconds, found.distance[:, None], "black", distance)
+    _plot(axes[1], f"area of the polygon, {unit}²", seconds, found.area[:, None], "black", area)
+    moved = f"displacement since frame {found.since}, {unit}"
+    _plot(axes[3], moved, seconds, found.displacement, ranges=of and of.displacement)
     _plot(axes[4], f"stretch since frame {found.since}; 1: unchanged", seconds, found.stretch)
     _plot(axes[2], f"path length, {unit}; dotted: without smoothing", seconds, found.path_length)
     for p in range(found.path_length_raw.shape[1]):
@@ -147,11 +156,19 @@ def _show_curves(axes: NDArray, found: Measures, frames_per_second: float, unit:
     for axis in axes[:5]:
         axis.set_xlabel("s", fontsize=8)
     handles, labels = axes[3].get_legend_handles_labels()
-    axes[5].legend(handles, labels, title="point", loc="upper left", fontsize=8, ncols=3)
+    shown = "point" if of is None else "point; bands hold 95 % of the true values"
+    axes[5].legend(handles, labels, title=shown, loc="upper left", fontsize=8, ncols=3)
 
 
-def _plot(axis: Axes, title: str, seconds: NDArray, values: NDArray, color: str | None = None) -> None:
-    """Curves (T, P); an empty panel that says so where nothing is known."""
+def _plot(
+    axis: Axes,
+    title: str,
+    seconds: NDArray,
+    values: NDArray,
+    color: str | None = None,
+    ranges: NDArray | None = None,
+) -> None:
+    """Curves (T, P), with bands of `ranges` to both sides; an empty panel that says so where nothing is known."""
     axis.set_title(title, fontsize=9)
     axis.tick_params(labelsize=8)
     axis.grid(alpha=0.3)
@@ -159,3 +176,6 @@ def _plot(axis: Axes, title: str, seconds: NDArray, values: NDArray, color: str 
         axis.text(0.5, 0.5, "none", ha="center", color="gray", transform=axis.transAxes)
     for p in range(values.shape[1]):
         axis.plot(seconds, values[:, p], color=color or f"C{p}", linewidth=1.2, label=str(p))
+        if ranges is not None:
+            low, high = np.maximum(values[:, p] - ranges[:, p], 0), values[:, p] + ranges[:, p]
+            axis.fill_between(seconds, low, high, color=color or f"C{p}", alpha=0.15, linewidth=0)

@@ -20,11 +20,16 @@ HD_ROWS = 720
 """From so many rows on, players take a video for BT.709 where it does not say its colors, below for BT.601."""
 BT709, SMPTE170M = 1, 6
 """Numbers of ISO 23091-2 for colors; the second has the matrix of BT.601."""
-CONSTANT_RATE_FACTOR = "10"
+CONSTANT_RATE_FACTOR = 10
 """Quality of x264: 0 is lossless, 51 the worst; from about 18 down no difference is seen."""
 
 
-def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
+def write_video(
+    path: Path,
+    images: Iterable[NDArray[np.uint8]],
+    frames_per_second: float,
+    constant_rate_factor: int = CONSTANT_RATE_FACTOR,
+) -> None:
     """Write an H.264 mp4, atomically. It says how its colors are stored, and can be played while it loads.
 
     Args:
@@ -44,7 +49,7 @@ def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_seco
         # Without `file:`, what stands before a colon in a name would be taken for a protocol.
         with av.open(f"file:{temporary}", "w", options={"movflags": "+faststart"}) as container:
             rate = Fraction(frames_per_second).limit_denominator(1001)
-            stream = container.add_stream("libx264", rate=rate, options={"crf": CONSTANT_RATE_FACTOR})
+            stream = container.add_stream("libx264", rate=rate, options={"crf": str(constant_rate_factor)})
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             context = stream.codec_context
             context.colorspace = context.color_primaries = context.color_trc = tag

@@ -13,8 +13,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import huber_loss
 from typing_extensions import override
 
-from endoprior.compute.relu_network import relu_network
-
+from ..relu_network import relu_network
 from .field import RadianceField, RayBatch, normal, uniform
 from .layers import Linear, encoded, encoded_size, layers_of, start
 from .presets import RadianceConfig

@@ -25,8 +25,8 @@ class BenchMasks(Command):
     """Training steps of each network, of 16 images each."""
     seed: int = 0
     """Seed of weights and examples."""
-    start: Path | None = None
-    """Weights file that the network of all sets is trained on from; the other networks start from nothing."""
+    pretrained: Path | None = None
+    """Weights of EfficientNet-Lite0 that each network starts from (docs/tool_network.md); random without them."""
     write_weights: Path | None = None
     """Also write the weights of the network that was trained with all sets to this file."""
 
@@ -44,19 +44,23 @@ def run(argv: list[str]) -> int:
         raise input_error("ENDOPRIOR_DATA", "the folder of the clips", repr(str(root)), f"Set {fix}")
     from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
-    from endoprior.tool_masks.network import network_from_file
 
     from .leave_one_out import ALL, Training, rows, weights_file, write_report
+    from .pretrained import pretrained
 
     require_writable_folder("OUT", args.out)
-    start = network_from_file(args.start) if args.start else None
+    start = pretrained(args.pretrained, args.seed) if args.pretrained else None
     args.out.mkdir(parents=True, exist_ok=True)
     with locked(args.out, args.out / ".lock"):
         table = []
         for row in rows(args.out, root, Training(args.steps, args.seed, start), say):
             say(f"{row.name}: {', '.join(f'{k} {v:.3f}' for k, v in row.score.total.scores().items())}")
             table.append(row)
-        settings = {"steps": args.steps, "seed": args.seed, "start": args.start.name if args.start else "nothing"}
+        settings = {
+            "steps": args.steps,
+            "seed": args.seed,
+            "pretrained": args.pretrained.name if args.pretrained else "no",
+        }
         report = write_report(args.out, table, settings)
         if args.write_weights:
             args.write_weights.write_bytes(weights_file(args.out, ALL).read_bytes())

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from .noise import Field, fractal_field, log_uniform, smooth_field
 
+MOST_SMOKE = 0.85
+"""Largest share of smoke in a color: through more of it, a tool cannot be told."""
+
 
 def random_view(rng: Generator, size: tuple[int, int]) -> NDArray[np.bool_]:
     """(h, w) True inside the endoscope's image: whole, round, oval, octagonal, cut off, or between black strips."""
@@ -40,8 +43,8 @@ def photographed(rng: Generator, scene: Field, view: NDArray[np.bool_]) -> NDArr
     """(h, w, 3), 0..255: the scene (h, w, 3) as a file shows it; black beyond the view."""
     size = scene.shape[:2]
     image = scene.astype(np.float32)
-    if rng.random() < 0.3:
-        image = _smoked(rng, image)
+    if rng.random() < 0.35:
+        image = smoked(rng, image)
     if rng.random() < 0.5:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.8))
     if rng.random() < 0.08:
@@ -82,13 +85,27 @@ def _bordered(rng: Generator, image_u8: NDArray[np.uint8], view: NDArray[np.bool
     return (beyond + inside[..., None] * (image_u8 - beyond)).clip(0, 255).astype(np.uint8)
 
 
-def _smoked(rng: Generator, image: Field) -> Field:
+def smoked(rng: Generator, image: Field) -> Field:
+    """Smoke in front of all, as a haze or as plumes; tools stay tools under it, and smoke alone is none."""
     size = image.shape[:2]
     dense = rng.uniform(0.05, 0.7) if rng.random() < 0.7 else rng.uniform(0.5, 0.85)
-    share = np.clip(dense * (1 + 0.6 * fractal_field(rng, size, log_uniform(rng, 40, 200), 4)), 0, 0.88)
-    tint = np.array([1, rng.uniform(0.75, 1.02), rng.uniform(0.6, 1.05)], np.float32)
-    tint *= np.float32(rng.uniform(0.35, 0.9))
+    share = dense * (1 + 0.6 * fractal_field(rng, size, log_uniform(rng, 40, 200), 4))
+    if rng.random() < 0.4:
+        share = share * rng.uniform(0, 0.6) + rng.uniform(0.3, 0.85) * _plume(rng, size)
+    share = np.clip(share, 0, MOST_SMOKE)
+    tint = np.array([1, rng.uniform(0.75, 1.04), rng.uniform(0.6, 1.15)], np.float32)
+    tint *= np.float32(rng.uniform(0.35, 0.95))
     return image + share[..., None] * (tint - image)
+
+
+def _plume(rng: Generator, size: tuple[int, int]) -> Field:
+    """(h, w) in [0, 1]: a billow of smoke with soft and hard edges, in a part of the view."""
+    h, w = size
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    wide = log_uniform(rng, 0.15, 0.8) * w
+    off = np.hypot(x - rng.uniform(0, w), (y - rng.uniform(0, h)) * rng.uniform(0.5, 2)) / wide
+    billows = 0.35 * fractal_field(rng, size, log_uniform(rng, 15, 70), 4, 0.6)
+    return np.clip((1 - off + billows) * log_uniform(rng, 0.8, 5), 0, 1)
 
 
 def motion_kernel(rng: Generator) -> Field:
@@ -116,11 +133,11 @@ def _toned(rng: Generator, image: Field) -> Field:
         y, x = np.mgrid[:h, :w].astype(np.float32)
         off = ((x / w - rng.uniform(0.35, 0.65)) ** 2 + (y / h - rng.uniform(0.35, 0.65)) ** 2) * 4
         image = image * (1 - rng.uniform(0, 0.7) * np.clip(off, 0, 1.35))[..., None]
-    if rng.random() < 0.2:  # a spot in which the lamp overexposes
+    if rng.random() < 0.3:  # a spot in which the lamp overexposes
         y, x = np.mgrid[:h, :w].astype(np.float32)
         radius = log_uniform(rng, 12, 110)
         off = ((x - rng.uniform(0, w)) ** 2 + (y - rng.uniform(0, h)) ** 2) / radius**2
-        image = image * np.exp(rng.uniform(0.4, 1.8) * np.exp(-off / 2))[..., None]
+        image = image * np.exp(rng.uniform(0.4, 2.2) * np.exp(-off / 2))[..., None]
     image = image ** np.float32(np.exp(rng.normal(0, 0.15)))
     knee = np.float32(rng.uniform(0.6, 1))
     above = np.maximum(image - knee, 0) / np.maximum(1 - knee, np.float32(1e-3))

@@ -25,7 +25,7 @@ from .composites import IGNORED, Frames, examples
 
 SCENES, PHOTOGRAPHS = 8, 2
 """Scenes in a batch, and how often each is photographed: painting takes longer than training."""
-RATE = 2e-3
+RATE = 1e-3
 """Highest learning rate; it rises for a twentieth of the steps and falls as half a cosine."""
 DECAY = 1e-2
 """Weight decay (AdamW)."""
@@ -127,8 +127,7 @@ def _step(state: _State, image: Tensor, label: Tensor, rate: float) -> float:
     for group in state.optimizer.param_groups:
         group["lr"] = rate
     state.network.train()
-    with torch.autocast("cpu", torch.bfloat16):
-        *coarse, fine = state.network.levels(image.contiguous(memory_format=torch.channels_last))
+    *coarse, fine = state.network.levels(image.contiguous(memory_format=torch.channels_last))
     loss = loss_of(fine[:, 0].float(), label)
     loss = loss + COARSE * sum(_coarse_loss(level[:, 0].float(), label) for level in coarse)
     state.optimizer.zero_grad(set_to_none=True)

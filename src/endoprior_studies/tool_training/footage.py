@@ -1,7 +1,8 @@
 """Frames with labels: real ones, by the hospital, scope and instruments that they come from, and those of phantoms.
 
 `ENDOPRIOR_DATA` holds the clips: `bowel_lift` (masks), `vocalfolds` (labels by hand), `mono_endo.mp4` (a part without
-tools), `wild` (clips without tools). What is trained for one set has not seen that set; `wild` is never trained on.
+tools), two folders of `tools_more` (single frames with masks), `wild` (clips without tools). What is trained for one
+set has not seen that set; `wild` is never trained on.
 
 Phantoms have a family of instruments over two kinds of tissue each, with exact masks. They are rendered in three
 dimensions and share nothing with the painted instruments of the training, so all of it is new to the network.
@@ -32,6 +33,8 @@ TOOL_FREE = range(97, 148)
 """Frames of `mono_endo` without a tool."""
 DARK, DARK_PX = 25, 25
 """Largest level and least width of what is black around a round image."""
+EYE_PX = 81
+"""Size of the square around each pixel of a tool in which `cataract1k` tells what is none, px."""
 WILD = ("colon_polyp", "colon_boxes", "fetoscopy", "broncho_phantom")
 """Clips without a tool."""
 FAMILIES = ("gray_blue", "black", "white_plastic", "steel", "gold", "green", "blue", "mixed")
@@ -58,6 +61,25 @@ def vocalfolds(root: Path) -> Iterator[Labeled]:
     for file in sorted((root / "vocalfolds").glob("*/images/*.jpg")):
         label = decode_image(file.parent.parent / "labels" / f"{file.stem}.png", None)
         yield f"{file.parent.parent.name} {file.stem}", read_color(file), table[label]
+
+
+def sisvse_gastrectomy(root: Path) -> Iterator[Labeled]:
+    """Robotic gastrectomy: gauze counts as a tool."""
+    yield from _single_frames(root, "sisvse_gastrectomy")
+
+
+def cataract1k(root: Path) -> Iterator[Labeled]:
+    """An eye through a microscope. Its lid speculum is not labeled, so only what is around the tools is told."""
+    for name, rgb_u8, label in _single_frames(root, "cataract1k"):
+        told = cv2.dilate(label, np.ones((EYE_PX, EYE_PX), np.uint8)) > 0
+        yield name, rgb_u8, np.where(told, label, IGNORED).astype(np.uint8)
+
+
+def _single_frames(root: Path, name: str) -> Iterator[Labeled]:
+    folder = root / "tools_more" / name
+    for file in sorted((folder / "images").glob("*.jpg")):
+        mask = read_tool_mask(folder / "masks" / f"{file.stem}.png")
+        yield f"{name} {file.stem}", read_color(file), mask.astype(np.uint8)
 
 
 def mono_endo(root: Path) -> Iterator[Labeled]:
@@ -89,9 +111,11 @@ SETS: dict[str, Callable[[Path], Iterator[Labeled]]] = {
     "bowel_lift": bowel_lift,
     "vocalfolds": vocalfolds,
     "mono_endo": mono_endo,
+    "sisvse_gastrectomy": sisvse_gastrectomy,
+    "cataract1k": cataract1k,
     "wild": wild,
 }
-TRAINED = ("bowel_lift", "vocalfolds", "mono_endo")
+TRAINED = ("bowel_lift", "vocalfolds", "mono_endo", "sisvse_gastrectomy", "cataract1k")
 """Sets whose frames may be trained on."""
 
 

@@ -117,15 +117,15 @@ def needle(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas:
     )
     turn = np.deg2rad(first)
     points = (np.array(arc) - (x, y)) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + (x, y)
-    _line(canvas, points, rng.uniform(1.5, 4), np.full(3, rng.uniform(0.4, 1), np.float32), rng)
+    painted_line(canvas, points, rng.uniform(1.5, 4), np.full(3, rng.uniform(0.4, 1), np.float32), rng)
     tone = rng.choice([0, 1, 2])
     color = (np.array([0.35, 0.15, 0.55]), np.full(3, rng.uniform(0.02, 0.2)), np.array([0.2, 0.4, 0.75]))[tone]
     steps = np.cumsum(rng.normal(0, 1, (40, 2)).cumsum(0) * rng.uniform(0.3, 1.2), 0)
-    _line(canvas, points[-1] + steps, rng.uniform(1, 2.2), color.astype(np.float32), rng)
+    painted_line(canvas, points[-1] + steps, rng.uniform(1, 2.2), color.astype(np.float32), rng)
     return canvas
 
 
-def _line(canvas: Canvas, points: NDArray, width: float, color: Field, rng: Generator) -> None:
+def painted_line(canvas: Canvas, points: NDArray, width: float, color: Field, rng: Generator) -> None:
     """A line of that width; lines are thinner than cv2's whole pixels, so they are drawn at four times the size."""
     h, w = canvas.covered.shape
     large = np.zeros((4 * h, 4 * w), np.uint8)

@@ -1,7 +1,7 @@
 """Paint one instrument: a shaft that enters from the border, a wrist or none, and one of many tips.
 
 Kinds: graspers and needle holders with windows or teeth, scissors, bipolar forceps, staplers, clip appliers, hooks,
-suction tubes, probes, retractors. All numbers are ranges; nothing is fitted to a real instrument.
+suction tubes, probes, retractors, ultrasonic shears. All numbers are ranges; nothing is fitted to a real instrument.
 `h, w` image size. Lengths in px of an image whose longer side is 256 px.
 """
 
@@ -31,16 +31,20 @@ from .parts import (
 
 WIDTH_PX = (5.0, 60.0)
 """Width of a shaft, even in its logarithm."""
+NEAR_WIDTH_PX = (45.0, 120.0)
+"""The same of a shaft close to the camera, which is out of focus."""
 REACH = (0.08, 0.75)
 """Length in the view, as a share of the image's diagonal."""
 
 
-def instrument(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas:
-    """Paint one instrument over (h, w, 3) `tissue`; it enters from the border of `view` (h, w)."""
+def instrument(
+    rng: Generator, tissue: Field, view: NDArray[np.bool_], widths: tuple[float, float] = WIDTH_PX
+) -> Canvas:
+    """Paint one instrument over (h, w, 3) `tissue`; it enters from the border of `view` (h, w), as wide as `widths`."""
     h, w = view.shape
     canvas = canvas_over(tissue, _lamp(rng, (h, w)))
-    start, along = _entry(rng, view)
-    width = log_uniform(rng, *WIDTH_PX)
+    start, along = entry(rng, view)
+    width = log_uniform(rng, *widths)
     tip = _TIPS[rng.choice(len(_TIPS), p=_OFTEN)]
     reach = rng.uniform(*REACH) * float(np.hypot(h, w))
     shaft, end, along = _shaft(rng, start, along, width, reach)
@@ -61,7 +65,7 @@ def _lamp(rng: Generator, size: tuple[int, int]) -> Field:
     return (np.clip(light, 0.15, 3) * strength).astype(np.float32)
 
 
-def _entry(rng: Generator, view: NDArray[np.bool_]) -> tuple[Point, Point]:
+def entry(rng: Generator, view: NDArray[np.bool_]) -> tuple[Point, Point]:
     """A point beyond the border of the view, and a direction (unit vector) into it."""
     h, w = view.shape
     angle = rng.uniform(0, 2 * np.pi)
@@ -105,11 +109,11 @@ def _shaft(
         round_tip=bool(rng.random() < 0.4),
         bands=tuple(bands),
     )
-    end = _end(part)
-    along = _turned(along, 2 * bend)
+    end = end_of(part)
+    along = turned(along, 2 * bend)
     parts = [part]
     if rng.random() < 0.5:  # a wrist: fork, pulleys, cables
-        along = _turned(along, rng.normal(0, 0.4))
+        along = turned(along, rng.normal(0, 0.4))
         size, material = width * rng.uniform(0.5, 1.7), tip_material(rng)
         widths = tuple(width * rng.uniform(0.6, 1.1) for _ in range(rng.integers(2, 5)))
         window = (rng.uniform(0.1, 0.5), rng.uniform(0.55, 0.95), rng.uniform(0.1, 0.5)) if rng.random() < 0.4 else None
@@ -119,8 +123,8 @@ def _shaft(
         if rng.random() < 0.4:
             wrist = replace(wrist, bands=((0.3, 0.6, tip_material(rng)),))
         parts.append(wrist)
-        end = _end(wrist)
-        along = _turned(along, rng.normal(0, 0.35))
+        end = end_of(wrist)
+        along = turned(along, rng.normal(0, 0.35))
     return tuple(parts), end, along
 
 
@@ -135,7 +139,7 @@ def _jaws(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part,
     teeth = rng.uniform(0.05, 0.35) if rng.random() < 0.4 else 0.0
     parts = []
     for side in ((0,), (-1, 1), (-1, 1), (-0.2, 1))[rng.integers(4)]:
-        toward = _turned(along, side * opening)
+        toward = turned(along, side * opening)
         bend = curve - side * opening * rng.uniform(0, 0.5)
         made = material if rng.random() < 0.9 else tip_material(rng)
         flat = rng.uniform(0, 1)
@@ -153,8 +157,8 @@ def _stapler(rng: Generator, end: Point, along: Point, width: float) -> tuple[Pa
     opening = abs(rng.normal(0, 0.15))
     bands = tuple((f, f + rng.uniform(0.02, 0.2), shaft_material(rng)) for f in rng.uniform(0, 1, rng.integers(0, 4)))
     window = (rng.uniform(0.1, 0.5), rng.uniform(0.55, 0.9), rng.uniform(0.1, 0.5)) if rng.random() < 0.4 else None
-    first = Part(end, _turned(along, opening), length, (width, width * rng.uniform(0.6, 1)), body, 0.6, 0, True, window)
-    second = Part(end, _turned(along, -opening), length, (width * 0.8, width * 0.4), tip_material(rng), 0.4)
+    first = Part(end, turned(along, opening), length, (width, width * rng.uniform(0.6, 1)), body, 0.6, 0, True, window)
+    second = Part(end, turned(along, -opening), length, (width * 0.8, width * 0.4), tip_material(rng), 0.4)
     return (second, replace(first, bands=bands))
 
 
@@ -162,8 +166,8 @@ def _hook(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part,
     """A thin rod with a bent end, or a spatula."""
     thin, material = max(width * rng.uniform(0.12, 0.4), 2.0), tip_material(rng)
     rod = Part(end, along, width * rng.uniform(0.3, 2.5), (thin, thin), material, bend=rng.normal(0, 0.1))
-    turned = _turned(along, rng.choice([-1, 1]) * rng.uniform(0.2, 1.7))
-    return (rod, Part(_end(rod), turned, width * rng.uniform(0.3, 1.2), (thin, thin * rng.uniform(0.5, 2)), material))
+    aside = turned(along, rng.choice([-1, 1]) * rng.uniform(0.2, 1.7))
+    return (rod, Part(end_of(rod), aside, width * rng.uniform(0.3, 1.2), (thin, thin * rng.uniform(0.5, 2)), material))
 
 
 def _tube(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part, ...]:
@@ -172,11 +176,11 @@ def _tube(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part,
     rim = Part(end - along * 2, along, 2 + width * rng.uniform(0.1, 0.5), (width, width), shaft_material(rng))
     parts = [rim]
     for _ in range(rng.integers(0, 5)):
-        at = end - along * width * rng.uniform(0.3, 3) + _turned(along, np.pi / 2) * width * rng.uniform(-0.3, 0.3)
+        at = end - along * width * rng.uniform(0.3, 3) + turned(along, np.pi / 2) * width * rng.uniform(-0.3, 0.3)
         size = width * rng.uniform(0.1, 0.3)
         parts.append(Part(at, along, size, (size, size), dark, 1))
     if rng.random() < 0.5:
-        parts.append(Part(_end(rim) - along * width * 0.15, along, width * 0.3, (width * 0.8, width * 0.7), dark, 1))
+        parts.append(Part(end_of(rim) - along * width * 0.15, along, width * 0.3, (width * 0.8, width * 0.7), dark, 1))
     return tuple(parts)
 
 
@@ -193,13 +197,24 @@ def _plate(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part
 def _clips(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part, ...]:
     """Two thin curved arms that hold a clip."""
     length, thin = width * rng.uniform(0.8, 2), max(width * rng.uniform(0.1, 0.25), 1.5)
-    material, across = tip_material(rng), _turned(along, np.pi / 2) * width * np.float32(0.3)
+    material, across = tip_material(rng), turned(along, np.pi / 2) * width * np.float32(0.3)
     clip: Material = colored(rng) if rng.random() < 0.5 else steel(rng)
     arms = [
-        Part(end + across * side, _turned(along, side * 0.2), length, (thin * 1.5, thin), material, 0.2, -side * 0.2)
+        Part(end + across * side, turned(along, side * 0.2), length, (thin * 1.5, thin), material, 0.2, -side * 0.2)
         for side in (-1, 1)
     ]
     return (*arms, Part(end + along * length * 0.6, along, length * 0.4, (width * 0.3, width * 0.2), clip, 0.5))
+
+
+def _shears(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part, ...]:
+    """A thin long rod that vibrates, and beside it an arm with a white pad."""
+    length, thin = width * rng.uniform(1.5, 5), max(width * rng.uniform(0.2, 0.4), 2.0)
+    opening, curve = abs(rng.normal(0, 0.2)), rng.normal(0, 0.1)
+    rod = Part(end, along, length, (thin * 1.3, thin), steel(rng), bend=curve)
+    toward = turned(along, opening)
+    arm = Part(end, toward, length * rng.uniform(0.9, 1.05), (thin * 2, thin), tip_material(rng), 0.4, curve)
+    pad = replace(arm, start=end - turned(toward, np.pi / 2) * thin * 0.5, widths=(thin, thin * 0.6))
+    return (rod, replace(pad, material=coated(rng, 0.6, 1)), arm) if rng.random() < 0.7 else (arm, rod)
 
 
 def _none(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part, ...]:
@@ -208,16 +223,17 @@ def _none(rng: Generator, end: Point, along: Point, width: float) -> tuple[Part,
 
 
 _Tip = Callable[[Generator, Point, Point, float], tuple[Part, ...]]
-_TIPS: tuple[_Tip, ...] = (_jaws, _stapler, _hook, _tube, _plate, _clips, _none)
-_OFTEN = (0.52, 0.1, 0.1, 0.09, 0.06, 0.05, 0.08)
+_TIPS: tuple[_Tip, ...] = (_jaws, _stapler, _hook, _tube, _plate, _clips, _shears, _none)
+_OFTEN = (0.46, 0.1, 0.1, 0.09, 0.06, 0.05, 0.06, 0.08)
 
 
-def _end(part: Part) -> Point:
+def end_of(part: Part) -> Point:
+    """(2,) x, y of the end of its axis."""
     across = np.array([-part.along[1], part.along[0]], np.float32)
     return part.start + part.along * np.float32(part.length) + across * np.float32(part.bend * part.length)
 
 
-def _turned(along: Point, angle: float) -> Point:
+def turned(along: Point, angle: float) -> Point:
     """The direction turned by `angle`, rad."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([cos * along[0] - sin * along[1], sin * along[0] + cos * along[1]], np.float32)

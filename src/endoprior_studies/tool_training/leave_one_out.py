@@ -54,7 +54,7 @@ class Training:
     steps: int
     seed: int
     start: ToolNetwork | None = None
-    """Where the network that sees all sets starts. The others start from nothing: it may know their set."""
+    """Where each network starts; it must know no frame of the sets."""
 
 
 def network_without(out: Path, root: Path, left_out: str, how: Training, say: Callable[[str], None]) -> ToolNetwork:
@@ -68,7 +68,7 @@ def network_without(out: Path, root: Path, left_out: str, how: Training, say: Ca
             training_frames(root, names),
             how.steps,
             how.seed,
-            start=how.start if left_out == ALL else None,
+            start=how.start,
             checkpoint=checkpoint,
             report=lambda step, loss: say(f"{file.stem}: step {step} of {how.steps}, loss {loss:.3f}"),
         )

@@ -80,6 +80,14 @@ def colored(rng: Generator) -> Material:
     return _plastic(rng, color)
 
 
+def vivid(rng: Generator) -> Material:
+    """Plastic of any hue but that of tissue, or white: catheters, sheaths, plastic clips."""
+    if rng.random() < 0.25:
+        return coated(rng, 0.6, 1.0)
+    rgb = colorsys.hsv_to_rgb(rng.uniform(0.11, 0.8), rng.uniform(0.25, 1), rng.uniform(0.3, 1))
+    return _plastic(rng, np.array(rgb, np.float32))
+
+
 def shaft_material(rng: Generator) -> Material:
     """Of a shaft: steel, black, gray, gray-blue, white, or colored."""
     kind = rng.choice(6, p=[0.2, 0.22, 0.15, 0.17, 0.1, 0.16])

@@ -48,17 +48,15 @@ def tissue(rng: Generator, size: tuple[int, int]) -> Field:
     image = _colored(rng, size, palette)
     for _ in range(rng.choice(4, p=[0.25, 0.35, 0.25, 0.15])):
         image = _organ_over(rng, image, _colored(rng, size, palette))
-    if rng.random() < 0.6:
-        image = _with_vessels(rng, image)
-    if rng.random() < 0.3:
-        image = _with_blood(rng, image)
-    if rng.random() < 0.3:
+    for add, often in MATTE_PARTS:
+        if rng.random() < often:
+            image = add(rng, image)
+    if rng.random() < 0.25:
         image = _with_bands(rng, image, palette)
     image = _lit(rng, image)
-    if rng.random() < 0.35:
-        image = _with_cavity(rng, image)
-    if rng.random() < 0.12:
-        image = _with_debris(rng, image)
+    for add, often in LIT_PARTS:
+        if rng.random() < often:
+            image = add(rng, image)
     return np.clip(image, 0, 1)
 
 
@@ -120,6 +118,68 @@ def _with_bands(rng: Generator, image: Field, palette: Palette) -> Field:
     return image
 
 
+def _with_ligaments(rng: Generator, image: Field) -> Field:
+    """Pale, glossy and rather straight bands, alone or as a fan: the tissue that looks most like a shaft."""
+    h, w = image.shape[:2]
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    angle, fan = rng.uniform(0, np.pi), rng.normal(0, 0.3)
+    foot_x, foot_y = rng.uniform(0, w), rng.uniform(0, h)
+    pale = np.array(colorsys.hsv_to_rgb(rng.uniform(0, 0.14), rng.uniform(0.04, 0.35), rng.uniform(0.6, 1)), np.float32)
+    for i in range(rng.integers(1, 5)):
+        turn, width = np.float32(angle + fan * i), log_uniform(rng, 2, 25)
+        dx, dy = x - foot_x, y - foot_y - i * rng.uniform(0, 2) * width
+        along, across = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
+        across = across + width * rng.uniform(0, 0.6) * np.sin(along / rng.uniform(40, 150) + rng.uniform(0, 6))
+        across = across / (width * np.clip(1 + 0.3 * smooth_field(rng, (h, w), 50), 0.3, 2))
+        share = np.clip((1 - np.abs(across)) * width * rng.uniform(0.15, 1), 0, 1) * np.float32(rng.uniform(0.5, 1))
+        threads = 1 + rng.uniform(0, 0.2) * np.sin(across * rng.uniform(3, 12) + smooth_field(rng, (h, w), 30))
+        body = pale * ((0.5 + 0.5 * np.sqrt(np.clip(1 - across**2, 0, 1))) * threads)[..., None]
+        gloss = np.exp(-(((across - rng.uniform(-0.5, 0.5)) / rng.uniform(0.08, 0.4)) ** 2))
+        gloss = gloss * np.clip(fractal_field(rng, (h, w), 16, 3), 0, 1.5) * rng.uniform(0, 0.6)
+        image = image + share[..., None] * (body + gloss[..., None] - image)
+    return image
+
+
+def _with_fat(rng: Generator, image: Field) -> Field:
+    """Lobes of fat: yellow to pale domes, dark between them, each with its highlight."""
+    size = image.shape[:2]
+    lobe = log_uniform(rng, 6, 35)
+    seeds = (rng.random(size) > 1 / lobe**2).astype(np.uint8)
+    seeds[0, 0] = 0  # at least one lobe
+    distance = cv2.distanceTransform(seeds, cv2.DIST_L2, 3) / np.float32(lobe)
+    dome = np.sqrt(np.clip(1.1 - distance**2, 0.05, 1))
+    tone = colorsys.hsv_to_rgb(rng.uniform(0.07, 0.15), rng.uniform(0.1, 0.75), rng.uniform(0.6, 1))
+    field = smooth_field(rng, size, log_uniform(rng, 40, 150)) - rng.uniform(-0.6, 0.8)
+    share = 1 / (1 + np.exp(-np.clip(field * rng.uniform(5, 40), -30, 30)))
+    return image + share[..., None] * (np.array(tone, np.float32) * dome[..., None] - image)
+
+
+def _with_fibers(rng: Generator, image: Field) -> Field:
+    """Pale threads of loose tissue in one direction, as where it is being divided."""
+    h, w = image.shape[:2]
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    turn = rng.uniform(0, np.pi)
+    across = (
+        y * np.cos(turn) - x * np.sin(turn) + smooth_field(rng, (h, w), log_uniform(rng, 15, 60)) * rng.uniform(1, 8)
+    )
+    threads = ridges(np.sin(across / log_uniform(rng, 0.8, 5)), rng.uniform(0.2, 0.8))
+    where = np.clip(fractal_field(rng, (h, w), log_uniform(rng, 20, 90), 3) - rng.uniform(-0.3, 0.8), 0, 1)
+    pale = np.array([1, rng.uniform(0.75, 1), rng.uniform(0.65, 1)], np.float32) * np.float32(rng.uniform(0.5, 1))
+    return image + (threads * where * np.float32(rng.uniform(0.3, 0.9)))[..., None] * (pale - image)
+
+
+def _with_dark_corner(rng: Generator, image: Field) -> Field:
+    """What the lamp does not reach behind the tissue: nearly black, a little blue, green or red."""
+    h, w = image.shape[:2]
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    turn, depth = rng.uniform(0, 2 * np.pi), rng.uniform(-0.1, 0.35)
+    beyond = ((x / w - 0.5) * np.cos(turn) + (y / h - 0.5) * np.sin(turn)) - 0.5 + depth
+    beyond = beyond * w + 6 * fractal_field(rng, (h, w), 50, 4)
+    share = 1 / (1 + np.exp(-np.clip(beyond * log_uniform(rng, 0.08, 2), -30, 30)))
+    tone = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0, 0.6), log_uniform(rng, 0.01, 0.15))
+    return image + share[..., None] * (np.array(tone, np.float32) - image)
+
+
 def _with_cavity(rng: Generator, image: Field) -> Field:
     """A lumen or a gap that the lamp hardly reaches: walls fade, fluid glitters, rings of cartilage or folds."""
     size = image.shape[:2]
@@ -169,3 +229,9 @@ def _lit(rng: Generator, albedo: Field) -> Field:
         off = (gloss_x + tilt_x) ** 2 + (gloss_y + tilt_y) ** 2
         image = image + (np.exp(-off / rng.uniform(0.002, 0.03)) * np.float32(rng.uniform(0.1, 1.2)))[..., None]
     return image
+
+
+MATTE_PARTS = ((_with_vessels, 0.6), (_with_fat, 0.15), (_with_blood, 0.3), (_with_fibers, 0.1))
+"""What lies on the organs and is shaded with them, and its share of the images."""
+LIT_PARTS = ((_with_ligaments, 0.15), (_with_dark_corner, 0.1), (_with_cavity, 0.35), (_with_debris, 0.12))
+"""What brings its own light, or takes it."""

@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ...core.checks import InputError, input_error
-from ..files import entries, files_with, in_order
+from ..files import entries, files_with, in_order, named_file, portable
 from ..frame_files import one_per_frame
 from ..images import Size
 from ..mask_files import MASK_SUFFIXES, OPTION, Mask, demand_known, name, read_user_mask, rule_of_files
@@ -117,7 +117,7 @@ def _ignore_masks(folder: Path, asked: str) -> MaskFolder | None:
         if asked:
             raise input_error(OPTION, "masks with labels", "masks of one kind", f"Remove {OPTION}.")
         # A frame is known by its image; the mask usually has the same name.
-        frames = sorted_frames([MaskFrame(image.name, _reader(root / mask)) for image, mask in named])
+        frames = sorted_frames([MaskFrame(image.name, _reader(mask)) for image, mask in named])
         return MaskFolder(frames, "nerfstudio masks; tools: where a mask is 0", False)
     return None
 
@@ -127,7 +127,8 @@ def _named(file: Path) -> list[tuple[Path, Path]]:
     text = read_text(file, "a JSON file", "Write it again.")
     try:
         frames = json.loads(text)["frames"]
-        return [(Path(each["file_path"]), Path(each["mask_path"])) for each in frames if each.get("mask_path")]
+        pairs = [(each["file_path"], each["mask_path"]) for each in frames if each.get("mask_path")]
+        return [(Path(portable(image)), named_file(file.parent, mask)) for image, mask in pairs]
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
         return []
 

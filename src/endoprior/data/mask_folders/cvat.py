@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import input_error
-from ..files import files_with, in_order
+from ..files import files_with, in_order, portable
 from ..images import Size, decode_image
 from ..mask_files import Mask, demand_size
 from ..reading import kind_of, read_text
@@ -44,7 +44,7 @@ def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
     listed = ""
     if kind_of(root / LISTED) == "a file":  # images without a shape, for which some versions write no mask
         listed = read_text(root / LISTED, "a list of images", PNG_HINT)
-    every = {*files, *(Path(line.strip()).name for line in listed.splitlines() if line.strip())}
+    every = {*files, *(Path(portable(line.strip())).name for line in listed.splitlines() if line.strip())}
     wanted = [colors[name] for name in tools]
     frames = [
         MaskFrame(f"{file.name}.png", _reader(files.get(file.name), colors, wanted))
@@ -122,7 +122,7 @@ def xml_annotations(file: Path, asked: str) -> MaskFolder | None:
 
 
 def _frame(file: Path, image: ElementTree.Element, tools: list[str]) -> MaskFrame:
-    name = Path(image.get("name", "")).name
+    name = Path(portable(image.get("name", ""))).name
     subject = f"{file}: {name}"
     shapes = [shape for shape in image if shape.tag in SHAPES and shape.get("label") in tools]
 

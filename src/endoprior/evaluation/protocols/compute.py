@@ -46,7 +46,7 @@ def score_protocols(names: Sequence[str], context: EvaluationContext, reading: D
         if not context.networks:
             return ScoreUnavailable(NETWORKS_OFF)
         try:  # VGG16 has 530 MB, too much to download unasked
-            return lpips_distance(backbone, context.weights_dir, download=backbone == "alex")
+            return lpips_distance(backbone, context.weights_dir, download=context.download and backbone == "alex")
         except ScoreUnavailable as reason:
             return reason
 

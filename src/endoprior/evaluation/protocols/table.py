@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ...core.checks import input_error
+from ...core.checks import input_error, or_did_you_mean
 from ...system.plugins import Registry
 from ..score import Score
 
@@ -91,5 +91,10 @@ def chosen_protocols(text: str) -> tuple[str, ...]:
     names, known = [name.strip() for name in text.split(",")], PROTOCOLS.names()
     for name in names:
         if name not in (*known, ALL):
-            raise input_error("--protocol", f"{', '.join(known)} or {ALL}", repr(name), "see docs/scores.md.")
+            raise input_error(
+                "--protocol",
+                f"{', '.join(known)} or {ALL}",
+                repr(name),
+                or_did_you_mean("see docs/scores.md.", name, known),
+            )
     return tuple(name for name in known if ALL in names or name in names)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...core.checks import check_shape
 from ...core.geometry import camera_to_world
 from ..context import EvaluationContext
-from ..score import scores_from
+from ..score import Score
 
 AXIS_MM = 1e-3
 """Each camera axis counts as a point this far from the camera's center when paths are aligned, mm.
@@ -25,16 +25,28 @@ AXIS_MM = 1e-3
 Far too little to matter where the camera moves, enough to decide what its centers leave open: the turn about a straight
 path, or every turn of a camera at rest. A true path whose RMS distance from its mean is smaller is at rest."""
 ROUNDING = 1e-12  # An estimated path is at rest if its extent is below this share of its largest coordinate
-SCORES = scores_from("""
-    ate_mm | camera path error | true mm | lower | 3 | relative | motion | 0 is the true path
-        Root mean square distance of camera centers from the true ones, after alignment; with ground truth only.
-    rpe_mm | camera step error | true mm | lower | 3 | relative | motion | -
-        Root mean square error of the camera's translation from frame to frame.
-    rpe_deg | camera turn error | deg | lower | 3 | relative | motion | 0 turns as the true camera
-        Mean angle by which the camera's turn from frame to frame is wrong.
-    rotation_error_deg | camera rotation error | deg | lower | 3 | relative | motion | -
-        Mean angle between the camera's axes and the true ones, after alignment.
-""")
+SCORES = (
+    Score(
+        "ate_mm", "camera path error", "mm", False, 3,
+        "Root mean square distance of camera centers from the true ones, after alignment; with ground truth only.",
+        group="motion", hint="0 is the true path", in_true_mm=True,
+    ),
+    Score(
+        "rpe_mm", "camera step error", "mm", False, 3,
+        "Root mean square error of the camera's translation from frame to frame.",
+        group="motion", in_summary=False, in_true_mm=True,
+    ),
+    Score(
+        "rpe_deg", "camera turn error", "deg", False, 3,
+        "Mean angle by which the camera's turn from frame to frame is wrong.",
+        group="motion", hint="0 turns as the true camera",
+    ),
+    Score(
+        "rotation_error_deg", "camera rotation error", "deg", False, 3,
+        "Mean angle between the camera's axes and the true ones, after alignment.",
+        group="motion", in_summary=False,
+    ),
+)  # fmt: skip
 ONE_FRAME = "a single frame has no motion"
 
 

@@ -14,23 +14,35 @@ from numpy.typing import NDArray
 
 from ...core.checks import check_shape
 from ...footage.components import Mask
-from ..score import scores_from
+from ..score import Score
 from .image import check_finite_float, checked_mask
 
 if TYPE_CHECKING:
     from ..context import EvaluationContext
 
 LEAST_ALPHA = 1e-6
-SCORES = scores_from("""
-    depth_rmse_mm | depth RMSE | mm | lower | 3 | relative | depth | 0 is exact; measured depth errs too
-        Root mean square error of rendered depth where depth was measured on tissue.
-    depth_rmse_by_alpha_mm | depth RMSE by alpha | mm | lower | 3 | relative | depth | -
-        The same of rendered depth divided by alpha, as some methods train it: thin tissue is not too near.
-    depth_rmse_endogaussian | depth RMSE (EndoGaussian's) |  | lower | 3 | relative | depth | -
-        The depth figure of EndoGaussian's program, whose 8-bit depths wrap; only to compare with its tables.
-    depth_instability_mm | depth instability | mm | lower | 3 | relative | depth | includes true motion
-        The published one: mean absolute change of rendered depth on tissue between adjacent frames of the video.
-""")
+SCORES = (
+    Score(
+        "depth_rmse_mm", "depth RMSE", "mm", False, 3,
+        "Root mean square error of rendered depth where depth was measured on tissue.",
+        group="depth", hint="0 is exact; measured depth errs too",
+    ),
+    Score(
+        "depth_rmse_by_alpha_mm", "depth RMSE by alpha", "mm", False, 3,
+        "The same of rendered depth divided by alpha, as some methods train it: thin tissue is not too near.",
+        group="depth", in_summary=False,
+    ),
+    Score(
+        "depth_rmse_endogaussian", "depth RMSE (EndoGaussian's)", "", False, 3,
+        "The depth figure of EndoGaussian's program, whose 8-bit depths wrap; only to compare with its tables.",
+        group="depth", in_summary=False,
+    ),
+    Score(
+        "depth_instability_mm", "depth instability", "mm", False, 3,
+        "The published one: mean absolute change of rendered depth on tissue between adjacent frames of the video.",
+        group="depth", hint="includes true motion",
+    ),
+)  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:

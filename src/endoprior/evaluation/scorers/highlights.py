@@ -7,17 +7,23 @@ import numpy as np
 from ...model.colors import changes_color
 from ...model.highlights import without_highlights
 from ..context import EvaluationContext, to_uint8
-from ..score import scores_from
+from ..score import Score
 from .image import psnr_tissue
 
 LEAST = 10.0
 """Pixels count where a highlight adds at least this much to the mean of the three colors, of 255."""
-SCORES = scores_from("""
-    psnr_no_highlights | PSNR below highlights | dB | higher | 2 | absolute | image | -
-        PSNR of tissue below highlights, these taken out, against the true tissue without them; ground truth only.
-    psnr_highlights_kept | PSNR below highlights, kept | dB | higher | 2 | absolute | image | -
-        The same with the highlights as they were trained: how much there is to take out.
-""")
+SCORES = (
+    Score(
+        "psnr_no_highlights", "PSNR below highlights", "dB", True, 2,
+        "PSNR of tissue below highlights, these taken out, against the true tissue without them; ground truth only.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "psnr_highlights_kept", "PSNR below highlights, kept", "dB", True, 2,
+        "The same with the highlights as they were trained: how much there is to take out.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+)  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:

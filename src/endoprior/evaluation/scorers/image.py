@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...core.checks import check_shape
 from ...core.ranges import spread
 from ...footage.components import Mask
-from ..score import ScoreUnavailable, scores_from
+from ..score import Score, ScoreUnavailable
 
 if TYPE_CHECKING:
     from ..context import EvaluationContext
@@ -29,22 +29,43 @@ TRAINING_FRAMES = 8  # Of these the PSNR is that of training
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Side and standard deviation of the Gaussian window, px
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Stabilizers of the luminance term, and of that of contrast and structure, for images in [0, 1]."""
-SCORES = scores_from("""
-    psnr | PSNR | dB | higher | 2 | absolute | image | as published: tools count as equal
-        The published one: both images are multiplied by the tissue mask, the mean squared error is over the frame.
-    psnr_tissue | tissue PSNR | dB | higher | 2 | absolute | image | above 35 dB hard to tell from the frame
-        PSNR over the tissue pixels alone.
-    psnr_train | training PSNR | dB | higher | 2 | absolute | image | -
-        Tissue PSNR of up to 8 training frames; far above that of held-out ones, what lies between is left to chance.
-    ssim | SSIM |  | higher | 4 | absolute | image | 1 is identical
-        Structural similarity of the masked images over the frame.
-    strict_psnr | strict PSNR | dB | higher | 2 | absolute | image | -
-        PSNR over the tissue pixels of rendered color that is not rounded to 8 bits.
-    strict_ssim | strict SSIM |  | higher | 4 | absolute | image | -
-        SSIM averaged over the tissue pixels, of rendered color that is not rounded to 8 bits.
-    seam_psnr | seams | dB | higher | 2 | relative | image | 0: the borders do not show
-        Tissue PSNR of frames in which two windows overlap, minus that of the others; scenes of several windows only.
-""")
+SCORES = (
+    Score(
+        "psnr", "PSNR", "dB", True, 2,
+        "The published one: both images are multiplied by the tissue mask, the mean squared error is over the frame.",
+        compare="absolute", group="image", hint="as published: tools count as equal",
+    ),
+    Score(
+        "psnr_tissue", "tissue PSNR", "dB", True, 2,
+        "PSNR over the tissue pixels alone.",
+        compare="absolute", group="image", hint="above 35 dB hard to tell from the frame",
+    ),
+    Score(
+        "psnr_train", "training PSNR", "dB", True, 2,
+        "Tissue PSNR of up to 8 training frames; far above that of held-out ones, what lies between is left to chance.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "ssim", "SSIM", "", True, 4,
+        "Structural similarity of the masked images over the frame.",
+        compare="absolute", group="image", hint="1 is identical",
+    ),
+    Score(
+        "strict_psnr", "strict PSNR", "dB", True, 2,
+        "PSNR over the tissue pixels of rendered color that is not rounded to 8 bits.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "strict_ssim", "strict SSIM", "", True, 4,
+        "SSIM averaged over the tissue pixels, of rendered color that is not rounded to 8 bits.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "seam_psnr", "seams", "dB", True, 2,
+        "Tissue PSNR of frames in which two windows overlap, minus that of the others; scenes of several windows only.",
+        group="image", hint="0: the borders do not show",
+    ),
+)  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:

@@ -27,7 +27,7 @@ from ..networks import (
     load_weights,
     select_weights,
 )
-from ..score import ScoreUnavailable, scores_from
+from ..score import Score, ScoreUnavailable
 from .image import check_images
 
 if TYPE_CHECKING:
@@ -37,12 +37,18 @@ HEADS_VERSION = "0.1"  # Version of the calibrated heads: the one every publishe
 Backbone = Literal["alex", "squeeze", "vgg"]
 CLASSIFIERS: dict[Backbone, WeightFiles] = {"alex": ALEXNET, "squeeze": SQUEEZENET, "vgg": VGG16}
 MIN_SIZE = 32  # Shortest side, px: much below it the deepest features have no pixel left
-SCORES = scores_from("""
-    lpips | LPIPS |  | lower | 4 | relative | image | 0 is identical
-        The published one: perceptual distance of the masked images by AlexNet; needs its weights.
-    lpips_squeeze | LPIPS (squeeze) |  | lower | 4 | relative | image | - lpips
-        The same by SqueezeNet, where its weights are on this machine.
-""")
+SCORES = (
+    Score(
+        "lpips", "LPIPS", "", False, 4,
+        "The published one: perceptual distance of the masked images by AlexNet; needs its weights.",
+        group="image", hint="0 is identical",
+    ),
+    Score(
+        "lpips_squeeze", "LPIPS (squeeze)", "", False, 4,
+        "The same by SqueezeNet, where its weights are on this machine.",
+        group="image", in_summary=False, stands_for="lpips",
+    ),
+)  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:
@@ -51,7 +57,7 @@ def compute(context: EvaluationContext) -> None:
         context.skip("lpips", NETWORKS_OFF)
         return
     with context.skip_if_unavailable("lpips"):
-        _add(context, "lpips", lpips_distance("alex", context.weights_dir))
+        _add(context, "lpips", lpips_distance("alex", context.weights_dir, download=context.download))
     if squeeze := squeeze_distance(context, "lpips_squeeze"):
         with context.skip_if_unavailable("lpips_squeeze"):
             _add(context, "lpips_squeeze", squeeze)

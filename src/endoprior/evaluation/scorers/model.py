@@ -11,31 +11,58 @@ from ...model.scene import RenderedScene, Scene
 from ...model.single_scene import SingleScene
 from ...system.devices import wait_for
 from ..context import SPEED_OFF, EvaluationContext
-from ..score import ScoreUnavailable, scores_from
+from ..score import Score, ScoreUnavailable
 
 LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 40.0  # The paper's thresholds
 FPS_WARM_UP, FPS_RENDERS = 10, 60
 LONGEST_SECONDS = 30.0  # Time after which no further render starts: a radiance field may need minutes for one
-SCORES = scores_from(f"""
-    num_gaussians | Gaussians |  | - | 0 | relative | model | more are finer and slower
-        Gaussians of the scene, in all its windows.
-    gaussians_growth | Gaussians, end / start |  | - | 2 | absolute | model | -
-        Gaussians after the training over those before it.
-    num_low_prior | low prior |  | - | 0 | absolute | model | mostly seen in highlights or flat color
-        Gaussians seen at least {LOW_PRIOR_OBSERVATIONS} times whose texture-prior score is below {LOW_PRIOR}.
-    num_low_opacity | low opacity |  | - | 0 | absolute | model | -
-        Gaussians of opacity below {LOW_OPACITY}.
-    num_large_scale | large scale |  | - | 0 | absolute | model | -
-        Gaussians whose largest standard deviation exceeds {LARGE_SCALE_MM:g} mm.
-    fps | rendering | frames/s | higher | 1 | relative | speed | 
-        Frames rendered a second, deformation included.
-    fps_cached | cached rendering | frames/s | higher | 1 | relative | speed | motion computed beforehand
-        The same with deformations computed beforehand.
-    train_seconds | training | s | lower | 1 | relative | speed | 
-        Time of the training, reading included; not after `--resume`.
-    iterations_per_second | training speed | iterations/s | higher | 2 | relative | speed | 
-        Training iterations a second, by the log of the run.
-""")
+SCORES = (
+    Score(
+        "num_gaussians", "Gaussians", "", None, 0,
+        "Gaussians of the scene, in all its windows.",
+        group="model", hint="more are finer and slower",
+    ),
+    Score(
+        "gaussians_growth", "Gaussians, end / start", "", None, 2,
+        "Gaussians after the training over those before it.",
+        compare="absolute", group="model", in_summary=False,
+    ),
+    Score(
+        "num_low_prior", "low prior", "", None, 0,
+        f"Gaussians seen at least {LOW_PRIOR_OBSERVATIONS} times whose texture-prior score is below {LOW_PRIOR}.",
+        compare="absolute", group="model", hint="mostly seen in highlights or flat color",
+    ),
+    Score(
+        "num_low_opacity", "low opacity", "", None, 0,
+        f"Gaussians of opacity below {LOW_OPACITY}.",
+        compare="absolute", group="model", in_summary=False,
+    ),
+    Score(
+        "num_large_scale", "large scale", "", None, 0,
+        f"Gaussians whose largest standard deviation exceeds {LARGE_SCALE_MM:g} mm.",
+        compare="absolute", group="model", in_summary=False,
+    ),
+    Score(
+        "fps", "rendering", "frames/s", True, 1,
+        "Frames rendered a second, deformation included.",
+        group="speed",
+    ),
+    Score(
+        "fps_cached", "cached rendering", "frames/s", True, 1,
+        "The same with deformations computed beforehand.",
+        group="speed", hint="motion computed beforehand",
+    ),
+    Score(
+        "train_seconds", "training", "s", False, 1,
+        "Time of the training, reading included; not after `--resume`.",
+        group="speed",
+    ),
+    Score(
+        "iterations_per_second", "training speed", "iterations/s", True, 2,
+        "Training iterations a second, by the log of the run.",
+        group="speed",
+    ),
+)  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:

@@ -24,7 +24,7 @@ from ...model.colors import changes_color, with_fixed_color
 from ...system.parallel import frame_threads
 from ..context import NETWORKS_OFF, EvaluationContext, SceneFrames
 from ..networks import RAFT_LARGE, RAFT_SMALL, find_weights, import_torchvision, select_weights
-from ..score import ScoreUnavailable, scores_from
+from ..score import Score, ScoreUnavailable
 
 if TYPE_CHECKING:
     from torch.nn import Module
@@ -35,18 +35,33 @@ RAFT_SIDE_MULTIPLE, RAFT_MIN_SIZE = 8, 128
 """Sides are padded to multiples of the first, px; below the second RAFT's coarsest level has no pixel left."""
 FlowEstimator = Callable[[Image, Image], NDArray[np.float32]]
 """Gives the (H, W, 2) displacement (x, y) in px from the first to the second of two (H, W, 3) 8-bit RGB images."""
-SCORES = scores_from("""
-    flow_error_dis | flow error (DIS) | px | lower | 3 | relative | motion | 0 moves as the video does
-        Difference of rendered and true optical flow between consecutive frames of the split, by OpenCV's DIS.
-    flow_error | flow error | px | lower | 3 | relative | motion | 0 moves as the video does
-        The published one: the same by RAFT-large; needs its weights.
-    flow_error_raft_small | flow error (RAFT-small) | px | lower | 3 | relative | motion | - flow_error
-        The same by RAFT-small, where its weights are on this machine.
-    flow_error_dis_adjacent | flow error, adjacent (DIS) | px | lower | 3 | relative | motion | -
-        The same by DIS, between all adjacent frames of the video.
-    color_share | change by color |  | lower | 3 | absolute | motion | 0: all by motion; 1: nothing moves
-        Share of the change of rendered tissue over time that is lost when colors are fixed: motion does not make it.
-""")
+SCORES = (
+    Score(
+        "flow_error_dis", "flow error (DIS)", "px", False, 3,
+        "Difference of rendered and true optical flow between consecutive frames of the split, by OpenCV's DIS.",
+        group="motion", hint="0 moves as the video does",
+    ),
+    Score(
+        "flow_error", "flow error", "px", False, 3,
+        "The published one: the same by RAFT-large; needs its weights.",
+        group="motion", hint="0 moves as the video does",
+    ),
+    Score(
+        "flow_error_raft_small", "flow error (RAFT-small)", "px", False, 3,
+        "The same by RAFT-small, where its weights are on this machine.",
+        group="motion", in_summary=False, stands_for="flow_error",
+    ),
+    Score(
+        "flow_error_dis_adjacent", "flow error, adjacent (DIS)", "px", False, 3,
+        "The same by DIS, between all adjacent frames of the video.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "color_share", "change by color", "", False, 3,
+        "Share of the change of rendered tissue over time that is lost when colors are fixed: motion does not make it.",
+        compare="absolute", group="motion", hint="0: all by motion; 1: nothing moves",
+    ),
+)  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:
@@ -55,7 +70,8 @@ def compute(context: EvaluationContext) -> None:
         _add(context, "flow_error_dis", context.frames, dis_flow)
     if context.networks:
         with context.skip_if_unavailable("flow_error"):
-            _add(context, "flow_error", context.frames, raft_flow("large", context.weights_dir))
+            raft_large = raft_flow("large", context.weights_dir, download=context.download)
+            _add(context, "flow_error", context.frames, raft_large)
         with context.skip_if_unavailable("flow_error_raft_small"):
             raft_small = raft_flow("small", context.weights_dir, download=False)
             _add(context, "flow_error_raft_small", context.frames, raft_small)

@@ -16,7 +16,7 @@ import numpy as np
 from ...core.geometry import expected_depth
 from ...footage.stereo_order import measured_disparity, right_camera, warp_to_right
 from ..context import EvaluationContext
-from ..score import scores_from
+from ..score import Score
 from .depth import depth_rmse
 from .image import psnr_tissue
 from .lpips import squeeze_distance
@@ -24,36 +24,72 @@ from .lpips import squeeze_distance
 VEIL_SHARE = 0.05
 """Something hangs before the tissue where rendered depth is nearer than the true one by more than this share."""
 FARTHEST = 20  # Turn of the cameras that are also scored by themselves, degrees; the end of their names
-OF_HIDDEN = scores_from("""
-    psnr_behind_tool | PSNR behind tool | dB | higher | 2 | absolute | image | tissue that the tool hides
-        PSNR of the pixels that the tool hides, against the true tissue; with ground truth only.
-    psnr_behind_tool_seen | PSNR behind tool, seen | dB | higher | 2 | absolute | image | -
-        The same where a training frame shows that tissue at another time.
-    psnr_behind_tool_guessed | PSNR behind tool, guessed | dB | higher | 2 | absolute | image | -
-        The same where no training frame shows that tissue.
-    depth_rmse_behind_tool_mm | depth behind tool | mm | lower | 3 | relative | depth | tissue that the tool hides
-        Root mean square depth error of the pixels that the tool hides; with ground truth only.
-""")
-OF_SIDES = scores_from("""
-    side_psnr | side PSNR | dB | higher | 2 | absolute | image | the model turned
-        PSNR of tissue seen from cameras turned by 10 and 20 degrees or moved by 15 mm; with ground truth only.
-    side_psnr_20 | side PSNR at 20 degrees | dB | higher | 2 | absolute | image | -
-        The same from the two cameras turned by 20 degrees.
-    side_lpips | side LPIPS |  | lower | 4 | relative | image | -
-        LPIPS by SqueezeNet of these pictures, where its weights are on this machine.
-    side_depth_rmse_mm | side depth RMSE | mm | lower | 3 | relative | depth | -
-        Root mean square depth error of these pixels.
-    side_veil | side veil |  | lower | 4 | absolute | depth | -
-        Share of these pixels in which rendered depth is nearer than the tissue by more than 5 %: fog and spikes.
-""")
-OF_RIGHT_EYE = scores_from("""
-    right_psnr | right eye PSNR | dB | higher | 2 | absolute | image | a view never trained on
-        PSNR of tissue seen by both eyes, from the right one, not trained on but with --eyes both; stereo only.
-    right_lpips | right eye LPIPS |  | lower | 4 | relative | image | -
-        LPIPS by SqueezeNet of these pictures, where its weights are on this machine.
-    right_psnr_warp | right eye PSNR, warp | dB | higher | 2 | absolute | image | -
-        PSNR of these pixels in the left picture, moved to the right eye by measured depth; no scene is needed.
-""")
+OF_HIDDEN = (
+    Score(
+        "psnr_behind_tool", "PSNR behind tool", "dB", True, 2,
+        "PSNR of the pixels that the tool hides, against the true tissue; with ground truth only.",
+        compare="absolute", group="image", hint="tissue that the tool hides",
+    ),
+    Score(
+        "psnr_behind_tool_seen", "PSNR behind tool, seen", "dB", True, 2,
+        "The same where a training frame shows that tissue at another time.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "psnr_behind_tool_guessed", "PSNR behind tool, guessed", "dB", True, 2,
+        "The same where no training frame shows that tissue.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "depth_rmse_behind_tool_mm", "depth behind tool", "mm", False, 3,
+        "Root mean square depth error of the pixels that the tool hides; with ground truth only.",
+        group="depth", hint="tissue that the tool hides",
+    ),
+)  # fmt: skip
+OF_SIDES = (
+    Score(
+        "side_psnr", "side PSNR", "dB", True, 2,
+        "PSNR of tissue seen from cameras turned by 10 and 20 degrees or moved by 15 mm; with ground truth only.",
+        compare="absolute", group="image", hint="the model turned",
+    ),
+    Score(
+        "side_psnr_20", "side PSNR at 20 degrees", "dB", True, 2,
+        "The same from the two cameras turned by 20 degrees.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "side_lpips", "side LPIPS", "", False, 4,
+        "LPIPS by SqueezeNet of these pictures, where its weights are on this machine.",
+        group="image", in_summary=False,
+    ),
+    Score(
+        "side_depth_rmse_mm", "side depth RMSE", "mm", False, 3,
+        "Root mean square depth error of these pixels.",
+        group="depth", in_summary=False,
+    ),
+    Score(
+        "side_veil", "side veil", "", False, 4,
+        "Share of these pixels in which rendered depth is nearer than the tissue by more than 5 %: fog and spikes.",
+        compare="absolute", group="depth", in_summary=False,
+    ),
+)  # fmt: skip
+OF_RIGHT_EYE = (
+    Score(
+        "right_psnr", "right eye PSNR", "dB", True, 2,
+        "PSNR of tissue seen by both eyes, from the right one, not trained on but with --eyes both; stereo only.",
+        compare="absolute", group="image", hint="a view never trained on",
+    ),
+    Score(
+        "right_lpips", "right eye LPIPS", "", False, 4,
+        "LPIPS by SqueezeNet of these pictures, where its weights are on this machine.",
+        group="image", in_summary=False,
+    ),
+    Score(
+        "right_psnr_warp", "right eye PSNR, warp", "dB", True, 2,
+        "PSNR of these pixels in the left picture, moved to the right eye by measured depth; no scene is needed.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+)  # fmt: skip
 SCORES = (*OF_HIDDEN, *OF_SIDES, *OF_RIGHT_EYE)
 NO_SEEN = "not known where tissue behind the tool is seen at another time"
 NO_SIDE = "no side camera sees tissue that the endoscope sees, or these frames have no side views"

@@ -24,21 +24,36 @@ from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
 from ...system.parallel import frame_threads
 from ..context import EvaluationContext
-from ..score import ScoreUnavailable, scores_from
+from ..score import Score, ScoreUnavailable
 from .image import psnr_tissue
 
-SCORES = scores_from("""
-    gain_over_flow | above the moved frame | dB | higher | 2 | absolute | image | -
-        Tissue PSNR minus that of the nearest training frame, moved by optical flow (DIS) to the held-out one.
-    gain_over_mean | above the mean image | dB | higher | 2 | absolute | image | -
-        Tissue PSNR minus that of the mean of all training frames.
-    slip_px | slip against the flow | px | lower | 2 | relative | motion | -
-        Median distance, after 12 frames, between where the scene and where chained flow carries tissue; 640 px wide.
-    depth_triangulated_error | depth against triangulation |  | lower | 3 | relative | depth | -
-        Median relative difference between rendered depth and that of points triangulated with the scene's cameras.
-    depth_relief | depth relief against triangulation |  | higher | 2 | relative | depth | -
-        Correlation, within a frame, of the logarithms of rendered and triangulated depth; flat depth has none.
-""")
+SCORES = (
+    Score(
+        "gain_over_flow", "above the moved frame", "dB", True, 2,
+        "Tissue PSNR minus that of the nearest training frame, moved by optical flow (DIS) to the held-out one.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "gain_over_mean", "above the mean image", "dB", True, 2,
+        "Tissue PSNR minus that of the mean of all training frames.",
+        compare="absolute", group="image", in_summary=False,
+    ),
+    Score(
+        "slip_px", "slip against the flow", "px", False, 2,
+        "Median distance, after 12 frames, between where the scene and where chained flow carries tissue; 640 px wide.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "depth_triangulated_error", "depth against triangulation", "", False, 3,
+        "Median relative difference between rendered depth and that of points triangulated with the scene's cameras.",
+        group="depth", in_summary=False,
+    ),
+    Score(
+        "depth_relief", "depth relief against triangulation", "", True, 2,
+        "Correlation, within a frame, of the logarithms of rendered and triangulated depth; flat depth has none.",
+        group="depth", in_summary=False,
+    ),
+)  # fmt: skip
 BYTES_PER_PX = 60  # memory in which a thread follows a frame, bytes for each px
 MEAN_FRAMES = 60  # training frames in the mean image
 STARTS, AHEAD, GRID = 6, 12, 16

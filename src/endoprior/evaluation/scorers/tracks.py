@@ -30,7 +30,7 @@ from ...model.scene import Scene
 from ...model.surface import project_visible, render_surface, shown_pixels
 from ...system.memory import workers
 from ..context import EvaluationContext
-from ..score import ScoreUnavailable, scores_from
+from ..score import Score, ScoreUnavailable
 
 NEAR_TOOL_PX = 40  # Points within this distance of the tool mask are near the tool; px of an image 640 px wide
 THRESHOLDS_PX = (4, 8, 16, 32, 64)
@@ -42,41 +42,83 @@ RETURN_PX, RETURN_SHARE = 1.0, 0.05
 FLOW_BYTES = 40  # Memory per pixel while the flow of a pair of frames is computed, bytes
 FLOW_CHUNK = 16  # Number of frame pairs whose flow is computed together
 TOO_SMALL = f"frames are smaller than {MIN_SIZE_PX} px, the least for optical flow"
-END_ERROR = scores_from("""
-    track_end_error_mm | track end error | mm | lower | 3 | relative | motion | 0 follows the tissue
-        Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.
-""")
-ACCURACY = scores_from("""
-    track_error_mm | track error | mm | lower | 3 | relative | motion | 0 follows the tissue
-        Mean distance between carried and true points over all frames in which the point is visible.
-    track_error_px | track error | px | lower | 3 | relative | motion | -
-        The same distance in the image.
-    track_error_median_px | track error, median | px | lower | 3 | relative | motion | -
-        Median of that distance.
-    track_error_p90_px | track error, 90 % | px | lower | 3 | relative | motion | -
-        90th percentile of that distance.
-    track_error_after_hidden_mm | seen again | mm | lower | 3 | relative | motion | tissue that was hidden before
-        Track error where the point is visible again after at least one frame that hides it.
-    track_error_near_tool_mm | track near tool | mm | lower | 3 | relative | motion | -
-        Track error within 40 px of the tool mask, in px of an image 640 px wide.
-    track_error_pulled_mm | track, pulled | mm | lower | 3 | relative | motion | -
-        Track error of points that move by at least half of a pull; phantoms with regions only.
-    track_error_smooth_mm | track, smooth | mm | lower | 3 | relative | motion | -
-        Track error of other points on tissue with little texture; phantoms with regions only.
-    track_delta_avg | delta_avg |  | higher | 3 | absolute | motion | 1 follows the tissue
-        Share of visible points within 4, 8, 16, 32 and 64 px of the truth, mean of the five, as in STIR 2024.
-    track_average_jaccard | average Jaccard |  | higher | 3 | absolute | motion | 1: position and visibility right
-        TP / (TP + FP + FN) of position and visibility at these distances, mean of the five, as in TAP-Vid.
-    track_occlusion_accuracy | occlusion accuracy |  | higher | 3 | absolute | motion | 1: visibility right
-        Share of points whose visibility is predicted right, as in TAP-Vid.
-""")
+END_ERROR = (
+    Score(
+        "track_end_error_mm", "track end error", "mm", False, 3,
+        "Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.",
+        group="motion", hint="0 follows the tissue",
+    ),
+)  # fmt: skip
+ACCURACY = (
+    Score(
+        "track_error_mm", "track error", "mm", False, 3,
+        "Mean distance between carried and true points over all frames in which the point is visible.",
+        group="motion", hint="0 follows the tissue",
+    ),
+    Score(
+        "track_error_px", "track error", "px", False, 3,
+        "The same distance in the image.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_median_px", "track error, median", "px", False, 3,
+        "Median of that distance.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_p90_px", "track error, 90 %", "px", False, 3,
+        "90th percentile of that distance.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_after_hidden_mm", "seen again", "mm", False, 3,
+        "Track error where the point is visible again after at least one frame that hides it.",
+        group="motion", hint="tissue that was hidden before",
+    ),
+    Score(
+        "track_error_near_tool_mm", "track near tool", "mm", False, 3,
+        "Track error within 40 px of the tool mask, in px of an image 640 px wide.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_pulled_mm", "track, pulled", "mm", False, 3,
+        "Track error of points that move by at least half of a pull; phantoms with regions only.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_smooth_mm", "track, smooth", "mm", False, 3,
+        "Track error of other points on tissue with little texture; phantoms with regions only.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_delta_avg", "delta_avg", "", True, 3,
+        "Share of visible points within 4, 8, 16, 32 and 64 px of the truth, mean of the five, as in STIR 2024.",
+        compare="absolute", group="motion", hint="1 follows the tissue",
+    ),
+    Score(
+        "track_average_jaccard", "average Jaccard", "", True, 3,
+        "TP / (TP + FP + FN) of position and visibility at these distances, mean of the five, as in TAP-Vid.",
+        compare="absolute", group="motion", hint="1: position and visibility right",
+    ),
+    Score(
+        "track_occlusion_accuracy", "occlusion accuracy", "", True, 3,
+        "Share of points whose visibility is predicted right, as in TAP-Vid.",
+        compare="absolute", group="motion", hint="1: visibility right",
+    ),
+)  # fmt: skip
 """Scores that any prediction of tracks has."""
-BREAKS = scores_from("""
-    track_fold_rate | folds |  | lower | 4 | absolute | motion | 0: neighbors keep their order
-        Share of lines between a point and its nearest neighbors that point against the true line.
-    track_tear_rate | tears |  | lower | 4 | absolute | motion | 0: neighbors stay together
-        Share of such lines that are more than twice as long as the true line.
-""")
+BREAKS = (
+    Score(
+        "track_fold_rate", "folds", "", False, 4,
+        "Share of lines between a point and its nearest neighbors that point against the true line.",
+        compare="absolute", group="motion", hint="0: neighbors keep their order",
+    ),
+    Score(
+        "track_tear_rate", "tears", "", False, 4,
+        "Share of such lines that are more than twice as long as the true line.",
+        compare="absolute", group="motion", hint="0: neighbors stay together",
+    ),
+)  # fmt: skip
 REFERENCES = {"dis": ("flow", "chained optical flow (DIS)"), "still": ("no motion", "no motion")}
 """What stands beside the scene's scores, by the end of the name."""
 OF_REFERENCES = tuple(
@@ -317,18 +359,26 @@ def without_motion(true: TrueTracks, sequence: FrameSequence) -> PredictedTracks
 
 
 def by_chained_flow(true: TrueTracks, sequence: FrameSequence) -> PredictedTracks:
+    """The true points, moved from where they start as in `chained_flow`."""
+    return chained_flow(true.at_start(true.points), true.first, sequence)
+
+
+def chained_flow(starts: NDArray[np.floating], first: NDArray[np.intp], sequence: FrameSequence) -> PredictedTracks:
     """Points moved from frame to frame by optical flow (DIS), held-out frames included; a lost point moves on too.
 
     A point is visible in a frame unless it is outside of the image, under the tool mask, or the backward flow does not
     return to where it came from. Its depth is the measured one at its pixel, else the last known one.
     ScoreUnavailable where the frames are too small for optical flow.
+
+    Args:
+        starts: (P, 3) where each point starts, in camera axes of the frame `first` (P,), mm.
     """
-    frames = sequence.frames("video")
-    if min(sequence.camera(0).width, sequence.camera(0).height) < MIN_SIZE_PX:
+    frames, camera = sequence.frames("video"), sequence.camera(0)
+    if min(camera.width, camera.height) < MIN_SIZE_PX:
         raise ScoreUnavailable(TOO_SMALL)
-    first, depth = true.first, true.at_start(true.points)[:, 2]
-    pixels = np.tile(true.at_start(true.pixels), (len(sequence), 1, 1))
-    points, visible = np.tile(true.at_start(true.points), (len(sequence), 1, 1)), np.zeros_like(true.visible)
+    depth = starts[:, 2]
+    pixels = np.tile(_pixels(starts, camera), (len(sequence), 1, 1))
+    points, visible = np.tile(starts, (len(sequence), 1, 1)), np.zeros((len(sequence), len(starts)), bool)
     for k, (there, back) in enumerate(_flows(frames)):
         frame, moving = frames[k + 1], first <= k
         step = _flow_at(there, pixels[k], frame)

@@ -45,6 +45,26 @@ class Blocks {
     });
   }
 
+  // The time step at which what is followed changes from block k to the next: the middle of what both show; null where
+  // no time step shows both.
+  border(k) {
+    if (k < 0 || k + 1 >= this.blocks.length) return null;
+    const next = this.blocks[k + 1].first;
+    return next < this.end(k) ? Math.ceil((next + this.end(k) - 1) / 2) : null;
+  }
+
+  // The block whose Gaussians carry a point at a time step.
+  home(frame) {
+    return [...this.blocks.keys()].filter((k) => frame >= (this.border(k - 1) ?? this.blocks[k].first)).pop();
+  }
+
+  // The planes of a block, which need not be one of those in memory.
+  async borrow(k) {
+    if (this.planes[k]) return this.planes[k];
+    this.lent ??= new Aside(unpackBlock, [inflate, undoPrediction]);
+    return this.lent.call(this.packedBlock(k));
+  }
+
   // Unpacks the blocks of a time step, and no other.
   load(frame) {
     this.wanted = this.shown(frame);

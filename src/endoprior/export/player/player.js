@@ -6,20 +6,25 @@ const LONGEST_STEP = 0.25; // s that playing may jump when the browser was busy
 const BUDGET = 60; // ms for an image in motion: fewer pixels if it takes longer, all of them once it is static
 const COARSEST = 0.25; // of the full width
 const REST = 250; // ms after the last change
+const TAP = 6; // px: a finger that moves less has touched, not dragged
 const SWAY = { angle: 0.12, period: 6, turns: 2 }; // rad to both sides, s, how often: the start shows that it is a model
 
 const byId = (id) => document.getElementById(id);
 const stage = byId("stage");
 const canvas = byId("picture");
+const ruler = byId("ruler");
 const about = JSON.parse(byId("about").textContent);
 const numFrames = about.seconds.length;
-const state = { frame: 0, clock: 0, playing: false, speed: 1, loop: true, free: false, depth: false, smoke: false, base: 0 };
+const state = { frame: 0, clock: 0, playing: false, speed: 1, loop: true, free: false, depth: false, smoke: false, base: 0, measuring: false };
 const hand = new FreeCamera();
 const swaying = new FreeCamera(); // until the first touch
 let swayedFor = window.matchMedia("(prefers-reduced-motion: reduce)").matches ? Infinity : 0; // s
 let blocks = null;
 let painter = null;
 let sorter = null;
+let measuring = null;
+let pageWindow = null;
+let shown = null; // {frame, parts, view} of the image on the canvas
 let stale = true;
 let changedAt = 0; // ms, by hand
 let quality = 1; // share of the full width that can be rendered within the budget
@@ -45,7 +50,7 @@ function layOut(share) {
   const { scale } = fit();
   const [w, h] = state.free ? [width, height] : [Math.round(about.width * scale), Math.round(about.height * scale)];
   const place = { width: w, height: h, left: Math.floor((width - w) / 2), top: Math.floor((height - h) / 2) };
-  for (const [name, length] of Object.entries(place)) canvas.style[name] = `${length}px`;
+  for (const [name, length] of Object.entries(place)) canvas.style[name] = ruler.style[name] = `${length}px`;
   const density = share * Math.min(window.devicePixelRatio || 1, MOST_PIXELS_PER_PIXEL / scale);
   const buffer = [w, h].map((length) => Math.max(1, Math.round(length * density)));
   if (canvas.width !== buffer[0]) canvas.width = buffer[0];
@@ -80,6 +85,8 @@ function drawAnswer(order, { frame, parts, view, depth, smoke, share }) {
   layOut(share);
   painter.draw(frame, parts, order, view, depth, smoke);
   drawnQuality = share;
+  shown = { frame, parts, view };
+  drawRuler(ruler, measuring.at(frame), view);
   canvas.dataset.frame = frame;
   canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
   if (document.body.dataset.state === "loading") document.body.dataset.state = "ready";
@@ -128,12 +135,13 @@ function advance(seconds) {
 }
 
 function tellWhere() {
-  const counter = `Frame ${state.frame} of ${numFrames}`; // from 0, as every command and the viewer count
+  const counter = `Frame ${state.frame + 1} of ${numFrames}`;
   const seconds = `${about.seconds[state.frame].toFixed(2)} s`;
   byId("counter").textContent = counter;
   byId("seconds").textContent = seconds;
   byId("slider").value = state.frame;
   byId("slider").setAttribute("aria-valuetext", `${counter}, ${seconds}`);
+  tellMeasured();
 }
 
 // ---- view
@@ -184,9 +192,47 @@ function setLoop(loop) {
   byId("loop").setAttribute("aria-pressed", loop);
 }
 
+// ---- measuring
+
+function setMeasuring(on) {
+  state.measuring = on;
+  document.body.classList.toggle("measuring", on);
+  byId("measure").setAttribute("aria-pressed", on);
+  tellMeasured();
+}
+
+function tellMeasured(problem = "") {
+  const points = measuring ? measuring.points.length : 0;
+  const [length, rest] = problem ? ["", problem] : points || state.measuring ? measuring.text(state.frame) : ["", ""];
+  const strong = document.createElement("b");
+  strong.textContent = length;
+  byId("measured").replaceChildren(...(length ? [strong] : []), rest);
+  byId("measured").hidden = !length && !rest;
+  byId("clear").hidden = !points;
+}
+
+// A touch of the tissue, in CSS px of the window.
+function measureAt(x, y) {
+  const { left, top, width, height } = canvas.getBoundingClientRect();
+  const { frame, parts, view } = shown;
+  const pixel = [((x - left) / width) * view.size[0], ((y - top) / height) * view.size[1]];
+  const point = surfacePoint(parts, view, pixel);
+  if (!point) return tellMeasured("There is no surface there: touch the tissue.");
+  const update = () => { tellMeasured(); stale = true; };
+  measuring.add(point, frame).then(update).catch(failWith);
+  update();
+}
+
+function clearMeasured() {
+  measuring.clear();
+  tellMeasured();
+  stale = true;
+}
+
 // ---- hands: one finger or button turns, two fingers or another button move, wheel and pinch zoom
 
 const touching = new Map();
+let tapFrom = null; // where the only finger came down, until it drags
 
 function middleAndSpread() {
   const points = [...touching.values()];
@@ -198,11 +244,14 @@ function middleAndSpread() {
 function onDown(event) {
   canvas.setPointerCapture(event.pointerId);
   touching.set(event.pointerId, [event.clientX, event.clientY]);
+  tapFrom = touching.size === 1 && event.button === 0 ? [event.clientX, event.clientY] : null;
   canvas.classList.add("turning");
 }
 
 function onMove(event) {
   if (!touching.has(event.pointerId)) return;
+  if (tapFrom && Math.hypot(event.clientX - tapFrom[0], event.clientY - tapFrom[1]) < TAP) return;
+  tapFrom = null;
   const before = middleAndSpread();
   touching.set(event.pointerId, [event.clientX, event.clientY]);
   const after = middleAndSpread();
@@ -213,10 +262,13 @@ function onMove(event) {
   if (touching.size > 1 || event.buttons & 6 || event.shiftKey) hand.move(dx, dy, freeBase());
   else hand.turn(dx, dy);
   if (before.spread > 0 && after.spread > 0) hand.approach(before.spread / after.spread);
+  document.body.classList.add("gestured");
   changed();
 }
 
 function onUp(event) {
+  if (tapFrom && event.type === "pointerup" && state.measuring) measureAt(...tapFrom);
+  tapFrom = null;
   touching.delete(event.pointerId);
   if (!touching.size) canvas.classList.remove("turning");
 }
@@ -240,6 +292,10 @@ const KEYS = {
   d: () => setDepth(!state.depth),
   s: () => about.smoke && !state.free && setSmoke(!state.smoke),
   l: () => setLoop(!state.loop),
+  m: () => setMeasuring(!state.measuring),
+  c: () => pageWindow.setFolded(!pageWindow.folded),
+  w: () => pageWindow.setFull(!pageWindow.full),
+  Escape: () => pageWindow.setFull(false),
   r: () => hand.reset(),
   "+": () => zoom(0.9),
   "=": () => zoom(0.9),
@@ -289,7 +345,11 @@ function connect() {
     free: () => setFree(true),
     depth: () => setDepth(!state.depth),
     smoke: () => setSmoke(!state.smoke),
+    measure: () => setMeasuring(!state.measuring),
+    clear: clearMeasured,
     reset: () => { hand.reset(); changed(); },
+    fold: () => pageWindow.setFolded(!pageWindow.folded),
+    full: () => pageWindow.setFull(!pageWindow.full),
   };
   for (const [id, act] of Object.entries(clicks)) {
     byId(id).addEventListener("click", (event) => {
@@ -360,6 +420,7 @@ function run() {
 }
 
 async function start() {
+  pageWindow = new PageWindow(document.body);
   describe();
   tellWhere();
   setFree(false);
@@ -372,6 +433,7 @@ async function start() {
   byId("data").remove();
   await blocks.load(state.frame);
   painter = new Painter(canvas, about);
+  measuring = new Measuring(blocks);
   sorter = new Sorter(drawAnswer);
   connect();
   stage.removeAttribute("aria-busy");

@@ -5,69 +5,14 @@ A step is split into what turning, moving sideways and moving ahead do to a plan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .adjust import back_projected
+from .path_facts import PathMotion
 from .tracks import CameraPath, Lens, Tracks
 
-Kind = Literal["static", "turning", "translating", "forward", "backward", "unknown"]
 GAP = 5  # frames between two poses that are compared: jitter of single frames is smaller than motion over them
-LEAST_PX = 1.5  # a camera whose way shifts the image by less over such a gap (median) is at rest, px at a width of 640
-OFF_PX, OFF_SHARE = 4.0, 0.5  # a step contradicts the images if its shift is off by more than both, px at 640
-WAY = 0.2  # share of the shift that a way causes, below which the camera only turns
-AXIAL = 0.7  # share of the length of the way along the optical axis, above which the camera drives along it
-CONTRADICTED = 0.3  # share of such steps above which a path is wrong
-TURN = 0  # column of `PathMotion.parts_px`
-
-
-@dataclass(frozen=True)
-class PathMotion:
-    """What a path does to the image."""
-
-    shift_px: NDArray  # (T - 1,) mean shift from frame to frame; NaN where one of them is unexplained
-    parts_px: NDArray  # (N, 3) shift over `GAP` frames by turning, sideways and along the axis
-    axial: float  # length of the way along the optical axis, as a share of the length of all ways, 0..1
-    ahead: float  # way along the optical axis, -1..1: its sum as a share of its length, > 0 forward
-    px: float  # length of a pixel of an image 640 px wide
-
-    @property
-    def shares(self) -> NDArray:
-        """(3,) shares of turning, sideways and along the axis."""
-        total = self.parts_px.sum(0)
-        return total / max(float(total.sum()), 1e-9)
-
-    @property
-    def kind(self) -> Kind:
-        """Where its way leads; turning if it has hardly any."""
-        if not len(self.parts_px):
-            return "unknown"
-        if np.median(self.parts_px.max(1)) < LEAST_PX * self.px:
-            return "static"
-        if 1 - self.shares[TURN] < WAY:
-            return "turning"
-        return "translating" if self.axial < AXIAL else "forward" if self.ahead > 0 else "backward"
-
-    @property
-    def drives(self) -> bool:
-        """Whether it drives along the optical axis."""
-        return self.kind in ("forward", "backward")
-
-    @property
-    def reason(self) -> str:
-        """The measurements in a few words."""
-        words = "turning", "moving sideways", "moving forward" if self.ahead > 0 else "moving back"
-        return ", ".join(f"{share:.0%} {word}" for share, word in zip(self.shares, words, strict=True))
-
-    def contradicts(self, measured_px: NDArray) -> bool:
-        """Whether the images shift otherwise than the path says. Args: measured_px: (T - 1,) NaN where unknown."""
-        known = np.isfinite(self.shift_px) & np.isfinite(measured_px)
-        off = np.abs(self.shift_px[known] - measured_px[known])
-        wrong = (off > OFF_PX * self.px) & (off > OFF_SHARE * np.maximum(measured_px[known], self.shift_px[known]))
-        return bool(known.any() and wrong.mean() > CONTRADICTED)
 
 
 def path_motion(path: CameraPath, tracks: Tracks, lens: Lens, size: tuple[int, int]) -> PathMotion:

@@ -28,7 +28,7 @@ from .colmap import LONGEST, colmap_path, is_installed, with_poses
 from .follow import Follower, follow_camera
 from .kind import path_motion
 from .own import own_path
-from .pose_file import is_model, read_model_poses, read_poses
+from .pose_file import MM_PER_M, is_model, is_text, read_model_poses, read_poses, read_text_poses
 from .refine import refined_path
 from .shape import DepthShape, axial_cosine, fitted_shape
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
@@ -64,6 +64,7 @@ class Reading:
     unit_mm: float = 1.0  # mm per unit of the positions
     turn: NDArray | None = None  # (3, 3) rotation from the camera of the poses to that of the frames; None: the same
     sources: Sequence[int] | None = None  # place of each frame in the video, where a file has a row for each image
+    image_times: Sequence[float] = ()  # of all images of the video, or else of the frames, s
     image_names: Sequence[str] = ()  # of all images of the folder of the frames, where a file names images
 
     @property
@@ -175,8 +176,13 @@ def _given_path(
         sources = range(count) if reading.sources is None else reading.sources
         stored, known, rule = read_model_poses(Path(how), sources, reading.image_names)
         notes.append(f"{how}: poses {rule}; their unit is that of --poses-unit-mm")
+    elif is_text(Path(how)):
+        if reading.unit_mm == AS_OURS.unit_mm:
+            reading = replace(reading, unit_mm=MM_PER_M)  # what such files have
+        stored, rule = read_text_poses(Path(how), count, reading.sources, reading.image_times, reading.unit_mm)
+        notes.append(f"{how}: rows are matched {rule}; its unit is taken as {reading.unit_mm:g} mm")
     else:
-        stored = read_poses(Path(how), count, reading.sources)
+        stored = read_poses(Path(how), count)
     path = CameraPath(reading.ours(stored), known, np.ones(count))
     if has_depth:
         notes += _fit_notes(how, stored, frame, lens, reading)

@@ -9,67 +9,19 @@ camera: r is the length of the ray, and z its part along the axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .follow import Follower
+from .path_facts import DepthShape
 from .tracks import CameraPath, Lens
 
 PARALLAX_DEGREES = 2.0  # rays to a point differ by this, or its depth is that of the shading
 FEWEST = 200  # observations of such points
 LEAST_POWER, MOST_POWER = 1.15, 6.0
 CLEAR = 0.3  # share of the variance of log depth that the power explains
-REACHES, LIKE = (1 / 8, 1 / 18, 1 / 36), 0.1
-"""A point speaks for pixels within this distance, as a share of the width, and of this difference of log depth. What is
-left at the points after one reach is spread over the next (successive corrections)."""
-DOUBT = 0.05  # weight of no change beside that of one point at its place
-SMALL_WIDTH = 160  # the change is computed at this width, px
-MOST_RATIO = 6.0  # a distance is clipped to this ratio of the middle: the dark end of a tube has no measured one
-
-
-@dataclass(frozen=True)
-class DepthShape:
-    """How relative depth d becomes z: `middle` (d / middle)^power `cosine`, and a change for each frame."""
-
-    power: float
-    middle: float
-    cosine: NDArray[np.float32]  # (H, W) of the angle between the ray of a pixel and the axis
-    pixels: list[NDArray]  # (N, 2) px of the points of each frame; an empty list without points ...
-    change: list[NDArray]  # ... and (N,) the logarithm of their z as a multiple of that of the power and the scale
-
-    def powered(self, depth: NDArray) -> NDArray[np.float32]:
-        """Depth (H, W) with the power alone; 0 stays."""
-        ratio = np.maximum(depth, 0) / self.middle
-        clipped = np.clip(ratio**self.power, 1 / MOST_RATIO, MOST_RATIO)
-        return np.asarray(np.where(ratio > 0, self.middle * clipped, 0) * self.cosine, np.float32)
-
-    def shaped(self, index: int, depth: NDArray) -> NDArray[np.float32]:
-        """(H, W) depth of a frame with the power and its change; 0 stays."""
-        powered = self.powered(depth)
-        if not self.pixels or not len(self.pixels[index]):
-            return powered
-        at, change = self.pixels[index], self.change[index]
-        height, width = depth.shape
-        size = SMALL_WIDTH, max(round(height * SMALL_WIDTH / width), 1)
-        small = cv2.resize(powered, size, interpolation=cv2.INTER_NEAREST)
-        log, px = np.log(np.maximum(small, 1e-3)), width / SMALL_WIDTH
-        y, x = np.mgrid[: small.shape[0], : small.shape[1]].astype(np.float32) + 0.5
-        spot = np.clip((at / px).astype(int), 0, np.array(small.shape[::-1]) - 1)
-        left, field = change.astype(np.float32), np.zeros_like(log)
-        for reach in REACHES:
-            total, weight = np.zeros_like(log), np.full_like(log, DOUBT)
-            for (u, v), (i, j), value in zip(at / px, spot, left, strict=True):
-                near = ((x - u) ** 2 + (y - v) ** 2) / (reach * SMALL_WIDTH) ** 2 + ((log - log[j, i]) / LIKE) ** 2
-                share = np.exp(-near / 2)
-                total += share * value
-                weight += share
-            step = total / weight
-            field, left = field + step, left - step[spot[:, 1], spot[:, 0]]
-        factor = cv2.resize(np.exp(field), (width, height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(powered * factor, np.float32)
 
 
 def axial_cosine(lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...data.description import MOTION
 from .adjust import Observations, Resected, refined_pose
-
-if TYPE_CHECKING:
-    from .kind import PathMotion
-    from .shape import DepthShape
+from .path_facts import DepthShape, PathMotion
 
 REFINED = "refined with the camera path"  # where the focal length may come from: `sources.lens` of `sequence.json`
 HELD_OUT = 8  # one in this many tracks takes no part in any estimate: it measures how well a path explains the frames

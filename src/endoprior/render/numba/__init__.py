@@ -27,8 +27,13 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
         ValueError: the input is not float32 on the CPU, or its shapes disagree.
     """
     check(splats, background)
-    check_device(splats, background, "cpu")
+    demand_device(splats, background)
     return rasterize_with(KERNELS, splats, camera, background, depth_grad_to_means)
+
+
+def demand_device(splats: Splats, background: Tensor) -> None:
+    """Raise ValueError unless everything is float32 on the CPU."""
+    check_device(splats, background, "cpu")
 
 
 def camera_arrays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -25,6 +25,7 @@ import numpy as np
 from numba import njit, prange
 
 from ...compute import simd
+from ...compute.parallel_kernels import parallel_njit
 from ...compute.simd import (
     LANES,
     fma,
@@ -160,7 +161,7 @@ def _blend_tile(records, pairs, left, top, columns, rows, state):
     return len(pairs)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def composite_forward(
     records, pairs, tile_starts, by_cost, workers, background, color, depth, transmittance, tile_ends
 ):
@@ -279,7 +280,7 @@ def _differentiate_tile(records, pairs, needed, left, top, state, sums):
         sums[pairs[p, SLOT]] = f4(0.0)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def composite_backward(
     records, pairs, tile_starts, tile_ends, by_cost, workers,
     color, depth, transmittance, v_color, v_depth, v_alpha, sums,
@@ -298,7 +299,7 @@ def composite_backward(
             _differentiate_tile(records, pairs[start:end], needed, left, top, state, sums)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def gather(
     sums, slot_starts, conic_ldl, color_slopes2d, opacities,
     v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d, v_opacities,

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from ...compute.parallel_kernels import parallel_njit
 from .. import sh
 from ..constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
 
@@ -152,7 +153,7 @@ def _local_per_px(xx, xy, yy, det, b0, b1, c0, c1):
     )  # fmt: skip
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def project_forward(
     means, quats, scales, opacities, sh, color_slopes, view, center, lens, width, height,
     means2d, conic_ldl, z_out, colors, color_slopes2d, radii,
@@ -235,7 +236,7 @@ def _pull_turn(r, w, x, y, z):
     return v_w, v_x - 4 * x * (r[1, 1] + r[2, 2]), v_y - 4 * y * (r[0, 0] + r[2, 2]), v_z - 4 * z * (r[0, 0] + r[1, 1])
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def project_backward(
     means, quats, scales, sh, color_slopes, view, center, lens, radii,
     v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d, v_means, v_quats, v_scales, v_sh, v_color_slopes,

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ...compute.parallel_kernels import parallel_njit
 from ...compute.simd import LANES, prefetch
 from ..constants import ALPHA_MIN
 
@@ -141,7 +142,7 @@ def _pixels(center, before, after, size):
     return np.int64(first), np.int64(last) + 1
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def _write_records(means2d, conic_ldl, z, colors, color_slopes2d, opacities, radii, width, height, records, box_starts):
     # One iteration per Gaussian. Writes, if it is visible, its record and, at g + 1, how many tiles the box around it
     # touches: room enough for its pairs.
@@ -199,7 +200,7 @@ def _tile_rows(spans, tile_column):
     return first // TILE_HEIGHT, (end + TILE_HEIGHT - 1) // TILE_HEIGHT
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes, slot_starts, counts, costs):
     # One task per chunk of the depth order. Writes the pairs of each Gaussian into its box, with the tile in place of
     # the slot, and how many there are at slot_starts[g + 1]; adds up pairs and strip rows per (chunk, tile).
@@ -229,7 +230,7 @@ def _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes,
             slot_starts[g + 1] = place - box_starts[g]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@parallel_njit(error_model="numpy")
 def _sort_pairs(near_to_far, box_starts, boxes, slot_starts, cursors, pairs):
     # One task per chunk, as above; cursors (CHUNKS, L) say where each chunk's next pair of a tile goes in `pairs`.
     for chunk in prange(CHUNKS):

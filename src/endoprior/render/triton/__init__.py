@@ -52,10 +52,15 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
         InputError: Triton could not build its launcher.
     """
     check(splats, background)
+    demand_device(splats, background)
+    return rasterize_with(KERNELS, splats, camera, background, depth_grad_to_means)
+
+
+def demand_device(splats: Splats, background: Tensor) -> None:
+    """Raise ValueError unless everything is float32 on one CUDA device, and start Triton there."""
     check_device(splats, background, DEVICE)
     if DEVICE == "cuda":
         _start_driver()
-    return rasterize_with(KERNELS, splats, camera, background, depth_grad_to_means)
 
 
 @cache

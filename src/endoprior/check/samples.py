@@ -1,0 +1,122 @@
+"""What a few frames of a sequence tell, evenly spaced: polarity, unit, poses, the order of the eyes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..core.config import DataConfig
+from ..core.ranges import spread
+from ..core.types import Frame
+from ..data import FrameSequence
+from ..data.description import read_description, read_record
+from ..data.files import in_order
+from ..data.images import read_color
+from ..footage.components import Image, InOrder, Mask
+from ..footage.pose_fit import PoseFit, View, measure_poses
+from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
+from ..footage.units import Polarity, UnitGuess, guess_unit, mask_polarity
+from .finding import About
+
+SAMPLES = 20  # frames for measurements that are expensive
+CERTAIN = 0.5  # least certainty to report masks as inverted
+COMPARED = 3  # stereo pairs to compare
+
+
+@dataclass(frozen=True)
+class StereoFacts:
+    """Consistency of the left and right images."""
+
+    order: StereoOrder  # share of the image that matches in either order, mean over the compared frames
+    vertical_px: float  # median vertical offset of matching features, px, >= 0; NaN if there are too few matches
+
+    @property
+    def reason(self) -> str:
+        """The measurements in one line."""
+        rows = f"rows {self.vertical_px:.1f} px apart" if np.isfinite(self.vertical_px) else "too few matches"
+        return f"{self.order.reason}; {rows}"
+
+
+def about_sequence(sequence: FrameSequence, cfg: DataConfig) -> About:
+    """What is known of a sequence that was opened with these options, without its frames."""
+    described, record = read_description(sequence.path / "sequence.json"), read_record(sequence.path)
+    return About(sequence.path, len(sequence), described, dict(sequence.sources), cfg, record)
+
+
+def sample_frames(sequence: FrameSequence) -> list[Frame]:
+    """The frames of which masks and depth are measured."""
+    return [sequence.frame(i) for i in spread(len(sequence), SAMPLES)]
+
+
+def measure_polarity(samples: list[Frame]) -> Polarity:
+    """Of the masks as read: `tool_is_high` False means that tissue and tool are swapped."""
+    return mask_polarity([~frame.tissue_mask for frame in samples], [frame.rgb_u8 for frame in samples])
+
+
+def are_inverted(polarity: Polarity) -> bool:
+    """Whether tissue and tool are certainly swapped in masks as read."""
+    return not polarity.tool_is_high and polarity.certainty >= CERTAIN
+
+
+def as_read(polarity: Polarity) -> str:
+    """The measurements of masks as read, in one line."""
+    return polarity.reason.replace("high values cover", "pixels read as tool cover")
+
+
+def true_tissue(samples: list[Frame], polarity: Polarity) -> list[Mask]:
+    """(H, W) each, True on tissue; inverted masks are corrected."""
+    inverted = are_inverted(polarity)
+    return [~frame.tissue_mask if inverted else frame.tissue_mask for frame in samples]
+
+
+def measure_unit(samples: list[Frame], tissue: list[Mask]) -> UnitGuess:
+    """The unit of depth as read, on this tissue of the samples."""
+    pairs = zip(samples, tissue, strict=True)
+    return guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in pairs)
+
+
+def measure_pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
+    """Reproject depth between frames with the stored poses; None for a static camera or without enough corners."""
+    first = sequence.camera(0)
+
+    def view(index: int) -> View:
+        frame = sequence.frame(index)
+        return frame.rgb_u8, frame.tissue_mask, np.where(frame.depth_valid, frame.depth, np.float32(0))
+
+    matrix = np.array([[first.fx, 0, first.cx - 0.5], [0, first.fy, first.cy - 0.5], [0, 0, 1]])
+    stored = np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))])
+    poses = np.linalg.inv(stored).astype(np.float64)
+    return measure_poses(view, matrix, poses, relative=sequence.depth_is_guessed, each=each)
+
+
+def measure_stereo(sequence: FrameSequence) -> StereoFacts | None:
+    """Compare both cameras in a few frames; None without usable right images."""
+    pairs = _pairs(sequence)
+    known = [offset for offset in (vertical_offset_px(*pair) for pair in pairs) if np.isfinite(offset)]
+    order = _mean_order(pairs)
+    return order and StereoFacts(order, float(np.median(known)) if known else float("nan"))
+
+
+def order_of_eyes(sequence: FrameSequence) -> StereoOrder | None:
+    """Which images are the left ones; None without usable right images."""
+    return _mean_order(_pairs(sequence))
+
+
+def _pairs(sequence: FrameSequence) -> list[tuple[Image, Image]]:
+    """Left and right images of a few frames; empty unless the folder has a right PNG of that size for each frame."""
+    files = in_order((sequence.path / "right").glob("*.png"))
+    camera, count = sequence.camera(0), len(sequence)
+    if len(files) != count or read_color(files[0]).shape[:2] != (camera.height, camera.width):
+        return []  # shrunk, or only a part of the folder: the matching of images to frames is unknown
+    return [
+        (sequence.frame(int(i)).rgb_u8, read_color(files[int(i)], (camera.width, camera.height)))
+        for i in np.linspace(0, count - 1, COMPARED).round()
+    ]
+
+
+def _mean_order(pairs: list[tuple[Image, Image]]) -> StereoOrder | None:
+    orders = [stereo_order(*pair) for pair in pairs]
+    if not orders:
+        return None
+    return StereoOrder(*(float(np.mean([getattr(o, name) for o in orders])) for name in ("as_given", "exchanged")))
