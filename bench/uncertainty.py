@@ -30,7 +30,7 @@ from endoprior.evaluation.scoring import scored_data
 from endoprior.model import uncertainty
 from endoprior.model.carry import carry
 from endoprior.model.scene_file import load_scene
-from endoprior.model.surface import depth_at, render_surface
+from endoprior.model.surface import render_surface, surface_points
 from endoprior.model.uncertainty import Across, Along, Sources
 
 LEVELS = 0.5, 0.8, 0.95
@@ -66,10 +66,9 @@ def errors_of(data: Path, run: Path) -> Errors:
         camera = sequence.camera(first)
         shown = np.flatnonzero(tracks.visible[first])
         pixels = project(tracks.points[first, shown].astype(float), replace(camera, world_to_camera=np.eye(4)))[0]
-        depth = depth_at(render_surface(scene, first / total, camera), pixels)
-        known = np.isfinite(depth)
-        shown, start = shown[known], back_project(pixels[known], depth[known], camera)
-        own = np.full(len(shown), first, np.intp)
+        starts = surface_points(scene, pixels, np.full(len(pixels), first, np.intp))
+        known = np.isfinite(starts).all(1)
+        shown, start, own = shown[known], starts[known], np.full(known.sum(), first, np.intp)
         carried = carry(scene, start, own, (frames / total).tolist())
         of = uncertainty.sources_of(scene, carried, own, range(total))
         true = np.einsum("tij,tpj->tpi", to_world[:, :3, :3], tracks.points[:, shown].astype(float))

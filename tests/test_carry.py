@@ -10,12 +10,13 @@ import torch
 from export_scenes import moving_scene
 from hexplane_grids import planes
 
+from endoprior.core.geometry import project
 from endoprior.model.carry import NUM_CARRIERS, carry, carry_points
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.model.single_scene import SingleScene
-from endoprior.model.surface import project_visible, render_surface, shown_pixels
+from endoprior.model.surface import depth_at, project_visible, render_surface, shown_pixels, surface_points
 from endoprior.model.uncertainty import point_errors
 
 TIMES = [i / 10 for i in range(10)]
@@ -123,6 +124,20 @@ def test_a_surface_has_the_color_of_the_tissue_before_any_background(monkeypatch
     assert ((alpha > 0.5) & (alpha < 0.95)).any(), "where the background shows through"
     monkeypatch.setattr(type(scene), "background", (1.0, 1.0, 1.0))
     assert render_surface(scene, 0.0, camera).color == pytest.approx(black.color, abs=1e-5)
+
+
+def test_surface_points_lie_where_their_own_frame_shows_them():
+    scene, frames = moving_scene(), np.array([0, 6, 0])
+    camera = scene.cameras[0]
+    middle = [camera.width / 2, camera.height / 2]
+    pixels = np.array([middle, middle, [1.0, 1.0]])  # no tissue is in the corner
+    points = surface_points(scene, pixels, frames)
+    assert np.isnan(points[2]).all()
+    for point, frame in zip(points[:2], frames, strict=False):
+        at, z = project(point[None], scene.cameras[frame])
+        assert at[0] == pytest.approx(middle, abs=1e-3)
+        assert z == pytest.approx(depth_at(render_surface(scene, frame / 10, scene.cameras[frame]), at), rel=1e-6)
+    assert points[0, 2] != points[1, 2], "the tissue has moved"
 
 
 def test_pixels_on_the_border_and_beyond():

@@ -103,6 +103,11 @@ def cells_at(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp]
     return x, y
 
 
+def unit_vectors(vectors: NDArray) -> NDArray[np.float64]:
+    """(..., 3) vectors of length 1 in the same directions; 0 stays 0."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12), np.float64)
+
+
 def quaternion_to_matrix(quats: NDArray) -> NDArray:
     """Rotation matrices of quaternions (w, x, y, z) of any non-zero length.
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.geometry import length_unit, project
+from ..core.geometry import length_unit, project, unit_vectors
 from ..model.carry import CarriedPoints, carry
-from ..model.measures import SurfaceMotion, distance, measures_of, unit_vectors
+from ..model.measures import SurfaceMotion, distance, measures_of
 from ..model.scene import Scene
 from ..model.surface import render_surface
 from ..model.uncertainty import point_errors

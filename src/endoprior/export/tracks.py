@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.geometry import back_project
 from ..data import FrameSequence, load_sequence
 from ..evaluation.scoring import scored_data
 from ..model.carry import carry
 from ..model.scene import Scene
-from ..model.surface import Surface, depth_at, project_visible, render_surface
+from ..model.surface import Surface, depth_at, project_visible, render_surface, surface_points
 from ..model.uncertainty import LEVEL, point_errors
 from ..system.atomic import whole_folder
 from .axes import points_in_axes
@@ -125,17 +124,13 @@ def grid_query_points(surface: Surface, spacing: int) -> QueryPoints:
 
 def back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
     """(P, 3) world positions of the query points, mm; InputError for one that shows no surface."""
-    positions = np.empty((len(queries.pixels), 3))
-    for frame in np.unique(queries.frames):
-        own = np.flatnonzero(queries.frames == frame)
-        surface = render_surface(scene, frame / len(scene.cameras), scene.cameras[frame], min_alpha)
-        depth = depth_at(surface, queries.pixels[own])
-        if not np.isfinite(depth).all():
-            point = own[np.isnan(depth).argmax()]
-            x, y = queries.pixels[point]
-            got = f"({x:g}, {y:g}) in frame {frame} for point {point}, where no surface is rendered"
-            raise input_error("--points", "pixels that show tissue", got, "move it.")
-        positions[own] = back_project(queries.pixels[own], depth, scene.cameras[frame])
+    positions = surface_points(scene, queries.pixels, queries.frames, min_alpha)
+    missing = np.isnan(positions).any(1)
+    if missing.any():
+        point = missing.argmax()
+        x, y = queries.pixels[point]
+        got = f"({x:g}, {y:g}) in frame {queries.frames[point]} for point {point}, where no surface is rendered"
+        raise input_error("--points", "pixels that show tissue", got, "move it.")
     return positions
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ..core.geometry import back_project, pixel_centers
+from ..core.geometry import back_project, pixel_centers, unit_vectors
 from ..core.strain import Strain, strain_of
 from ..core.types import Camera
 from .carry import carry_points
@@ -89,11 +89,6 @@ def ranges_of(paths: NDArray, since: int, triangles: NDArray[np.intp], errors: P
         np.sqrt(np.square(errors.half_width(area_gradient(paths, triangles))).sum(1)) if len(triangles) else unknown,
         np.hypot(now, then),
     )
-
-
-def unit_vectors(vectors: NDArray) -> NDArray[np.float64]:
-    """(..., 3) vectors of length 1 in the same directions; 0 stays 0."""
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12), np.float64)
 
 
 def distance(a: NDArray, b: NDArray) -> NDArray[np.float64]:

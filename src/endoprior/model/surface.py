@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry import bilinear, cells_at, expected_depth, project
+from ..core.geometry import back_project, bilinear, cells_at, expected_depth, project
 from ..core.types import SURE_DEPTH, Camera, Frame
 from .scene import Scene, Window
 from .single_scene import SingleScene
@@ -44,6 +44,22 @@ def depth_at(surface: Surface, pixels: NDArray) -> NDArray[np.float64]:
     """(P,) depth between the pixel centers around (P, 2) pixels; NaN where one of them shows no surface."""
     depth = np.where(surface.depth > 0, surface.depth, np.nan).astype(np.float64)
     return bilinear(depth, pixels)
+
+
+def surface_points(
+    scene: Scene, pixels: NDArray, frames: NDArray[np.intp], min_alpha: float = 0.5
+) -> NDArray[np.float64]:
+    """(P, 3) points of the rendered surface at (P, 2) pixels of (P,) frames, world, mm; NaN where there is none.
+
+    Args:
+        min_alpha: as of `render_surface`.
+    """
+    points = np.empty((len(pixels), 3))
+    for frame in np.unique(frames):
+        own, camera = np.flatnonzero(frames == frame), scene.cameras[frame]
+        depth = depth_at(render_surface(scene, frame / len(scene.cameras), camera, min_alpha), pixels[own])
+        points[own] = back_project(pixels[own], depth, camera)
+    return points
 
 
 def shown_pixels(pixels: NDArray, tissue_mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -11,10 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.geometry import back_project, camera_to_world
+from ...core.geometry import camera_to_world, unit_vectors
 from ...model.carry import carry
-from ...model.measures import unit_vectors
-from ...model.surface import depth_at, render_surface
+from ...model.surface import surface_points
 from ...model.uncertainty import PointErrors, point_errors
 from ..context import EvaluationContext
 from ..score import Score
@@ -67,13 +66,8 @@ def compute(context: EvaluationContext) -> None:
         for score in SCORES:
             context.skip(score.name, NO_TRACKS)
         return
-    first, points = true.first, np.arange(true.visible.shape[1])
-    starts = np.full((len(points), 3), np.nan)
-    for frame in np.unique(first):
-        own, camera = np.flatnonzero(first == frame), sequence.camera(int(frame))
-        pixels = true.pixels[frame, own]
-        depth = depth_at(render_surface(scene, frame / len(sequence), camera), pixels)
-        starts[own] = back_project(pixels, depth, camera)
+    first = true.first
+    starts = surface_points(scene, true.at_start(true.pixels), first)
     known = np.flatnonzero(np.isfinite(starts).all(1))
     times = [i / len(sequence) for i in range(len(sequence))]
     carried = carry(scene, starts[known], first[known], times)
