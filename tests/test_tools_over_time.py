@@ -83,7 +83,7 @@ def test_a_resting_frame_is_averaged_by_powers_of_keep():
     rng = np.random.default_rng(1)
     values = [rng.normal(0, 1, (HEIGHT, WIDTH)).astype(np.float32) for _ in range(5)]
     looks = [look(value) for value in values]
-    links = [over_time.Link.between(*pair) for pair in pairwise(looks)]
+    links = [over_time.BidirectionalFlow.between(*pair) for pair in pairwise(looks)]
     found = over_time.carried(values, links)
     inner = np.s_[8:-8, 8:-8]
     for t, mean in enumerate(found):

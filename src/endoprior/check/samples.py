@@ -14,7 +14,7 @@ from ..data.description import read_description, read_record
 from ..data.files import in_order
 from ..data.images import read_color
 from ..footage.components import Image, InOrder, Mask
-from ..footage.pose_fit import PoseFit, View, measure_poses
+from ..footage.pose_fit import PoseFit, RgbdFrame, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
 from ..footage.units import Polarity, UnitGuess, guess_unit, mask_polarity
 from .finding import About
@@ -80,7 +80,7 @@ def measure_pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
     """Reproject depth between frames with the stored poses; None for a static camera or without enough corners."""
     first = sequence.camera(0)
 
-    def view(index: int) -> View:
+    def view(index: int) -> RgbdFrame:
         frame = sequence.frame(index)
         return frame.rgb_u8, frame.tissue_mask, np.where(frame.depth_valid, frame.depth, np.float32(0))
 

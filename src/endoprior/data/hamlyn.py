@@ -19,7 +19,7 @@ from ..footage.border import find_outside
 from .assemble import Pixels, assemble, kept_frames
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
-from .formats import Format
+from .formats import DatasetFormat
 from .frame_files import Kind, files_of_images
 from .images import read_color, read_depth_file, read_tool_mask
 from .poses import MATRIX_FILE, identity_poses, matrix_of_images, read_camera_matrix
@@ -158,4 +158,4 @@ def is_hamlyn(path: Path) -> bool:
     return (path / "images").is_dir() and (own_depth or own_camera or (bare and _is_named(path)))
 
 
-FORMAT = Format(is_hamlyn, load_hamlyn)
+FORMAT = DatasetFormat(is_hamlyn, load_hamlyn)

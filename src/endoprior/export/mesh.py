@@ -26,7 +26,7 @@ from ..core.types import Camera
 from ..model.scene import Scene
 from ..model.surface import Surface, render_surface
 from .axes import points_in_axes
-from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format
+from .formats import TIME_STEP_OPTIONS, Axes, ExportFormat, ExportOptions
 from .ply import colored, ply_bytes
 from .time_steps import TimeStep
 
@@ -278,7 +278,7 @@ def _triangles_of(corners: NDArray[np.intp], values: NDArray) -> NDArray[np.intp
     return np.concatenate([corners[num_inside == count][:, cut] for count, cut in _CUTS])
 
 
-FORMAT = Format(
+FORMAT = ExportFormat(
     suffixes=(".ply", ".obj", ".stl"),
     options=(*TIME_STEP_OPTIONS, "mesh_format", *SURFACE_OPTIONS),
     files=files,

@@ -19,7 +19,7 @@ from ..core.ranges import spread
 from .components import Image, InOrder, square
 from .optical_flow import follow_both_ways
 
-View = tuple[Image, NDArray, NDArray[np.float32]]
+RgbdFrame = tuple[Image, NDArray, NDArray[np.float32]]
 """Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""
 WORK_WIDTH = 320  # Wider images are resized to this width, px
 STARTS = 10  # Number of frames from which corners are followed
@@ -123,7 +123,7 @@ class _Tracks:
 
 
 def measure_poses(
-    view: Callable[[int], View],
+    view: Callable[[int], RgbdFrame],
     matrix: NDArray[np.float64],
     poses: NDArray[np.float64],
     given: Convention = "opencv",
@@ -194,7 +194,7 @@ def _best_unit(error: Callable[[float], float]) -> float:
     return plain or min((unit * FINER).tolist(), key=error)
 
 
-def _small(view: View, factor: float) -> View:
+def _small(view: RgbdFrame, factor: float) -> RgbdFrame:
     """Gray image, tissue and depth of a frame at the working size."""
     rgb_u8, tissue, depth = view
     gray = np.asarray(cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -206,7 +206,7 @@ def _small(view: View, factor: float) -> View:
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8), tissue, depth
 
 
-def _follow(view: Callable[[int], View], matrix: NDArray, start: int, count: int) -> _Tracks | None:
+def _follow(view: Callable[[int], RgbdFrame], matrix: NDArray, start: int, count: int) -> _Tracks | None:
     """Follow corners from a frame until they are far away; None if too few are left."""
     gray, tissue, depth = view(start)
     before = _corners(gray, tissue, depth)

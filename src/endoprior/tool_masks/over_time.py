@@ -61,7 +61,7 @@ def decide_over_time(looks: Iterable[Look], view: Mask) -> Iterator[SmallTools]:
 
 
 def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
-    links = [Link.between(before, after) for before, after in pairwise(looks)]
+    links = [BidirectionalFlow.between(before, after) for before, after in pairwise(looks)]
     odds = carried([np.clip(look.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS) for look in looks], links)
     regions = [candidate_regions(each, view) for each in odds]
     taken = [np.any([np.zeros_like(view), *(r.mask for r in found if r.is_tool)], axis=0) for found in regions]
@@ -73,7 +73,7 @@ def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
 
 
 @dataclass(frozen=True)
-class Link:
+class BidirectionalFlow:
     """Where the pixels of two neighboring frames are in each other, and how far that can be believed."""
 
     to_before: NDArray[np.float32]  # (h, w, 2) places in the frame before of the pixels of the frame after, px
@@ -82,7 +82,7 @@ class Link:
     trust_before: Values
 
     @classmethod
-    def between(cls, before: Look, after: Look) -> Link:
+    def between(cls, before: Look, after: Look) -> BidirectionalFlow:
         shape = before.log_odds.shape
         grid = np.dstack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1])))
         onward = back = np.zeros_like(grid)
@@ -100,7 +100,7 @@ class Link:
         return cls(grid + back, grid + onward, behind, ahead)
 
 
-def carried(values: list[Values], links: list[Link], least_trust: float = 0.0) -> list[Values]:
+def carried(values: list[Values], links: list[BidirectionalFlow], least_trust: float = 0.0) -> list[Values]:
     """(h, w) weighted mean of each frame's values and those of the frames around, carried along the flow."""
 
     def step(places: NDArray[np.float32], trust: Values) -> tuple[NDArray[np.float32], Values]:
