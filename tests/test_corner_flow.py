@@ -23,7 +23,7 @@ GRID = np.stack(np.meshgrid(np.arange(30.0, 90, 10), np.arange(30.0, 60, 10)), -
 
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2), (5.5, 4.25)])
 def test_a_shift_is_followed(shift):
-    there, kept = follow_both_ways(shifted(0, 0), shifted(*shift), GRID, 1.0)
+    there, kept = follow_both_ways(shifted(0, 0), shifted(*shift), GRID)
     assert kept.all() and there.shape == GRID.shape and there.dtype == np.float32
     assert np.abs(there - GRID - np.float32(shift)).max() < 0.1  # gray levels are whole numbers
 
@@ -31,7 +31,7 @@ def test_a_shift_is_followed(shift):
 def test_what_the_other_image_does_not_show_is_lost():
     first, second = shifted(0, 0), shifted(3, 0)
     second[:, 60:] = np.random.default_rng(1).integers(0, 255, second[:, 60:].shape)
-    _, kept = follow_both_ways(first, second, GRID, 0.7)
+    _, kept = follow_both_ways(first, second, GRID, max_error_px=0.7)
     assert kept[GRID[:, 0] < 40].all() and not kept[GRID[:, 0] > 75].any()
     _, kept = follow_both_ways(first, shifted(3, 0), GRID, 0.0)
     assert not kept.any(), "nothing is nearer than 0"

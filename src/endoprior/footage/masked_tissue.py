@@ -23,7 +23,7 @@ COMPARED, FEWEST = 24, 8  # pairs of frames; with fewer in which the tissue move
 MOVES_PX = 1.0  # the tissue moves if its median flow is above this, px
 WITH_TISSUE = 0.3  # difference to the motion of the tissue, as a share of that: 0.04 on tissue, 1 on tools (medians)
 NEARLY_ALL = 0.9  # share of the pairs
-LEAST_SHARE = 0.003  # smaller regions, as a share of the image, are not judged
+MIN_MASKED_REGION_SHARE = 0.003  # smaller regions, as a share of the image, are not judged
 INNER_PX = 2  # rims of regions mix both motions
 
 
@@ -79,7 +79,7 @@ def _likest(first: Image, later: Image, tool: Mask, tool_later: Mask) -> tuple[f
     labels, boxes = components(inner)
     best = nothing[1:]
     for i in range(1, len(boxes)):
-        if boxes[i, AREA] >= LEAST_SHARE * tissue.size:
+        if boxes[i, AREA] >= MIN_MASKED_REGION_SHARE * tissue.size:
             region = labels == i
             ratio = float(np.median(difference[region])) / max(speed, 1e-6)
             best = min(best, (ratio, _middle(region, shrink)))

@@ -21,6 +21,7 @@ HALVED_FROM_PX = 256
 """Flow of frames with at least this shorter side is computed at half size: four times faster, almost as accurate."""
 STUCK_PX, STUCK = 3.0, 0.3
 """Where the image goes by the first or more, px at a width of 640, a point that goes less than this share is stuck."""
+MAX_FORWARD_BACKWARD_PX = 1.0  # Largest forward-backward error of a corner that counts as followed
 FINE_SIDE_PX = 256  # Fine flow is computed on images shrunk by a whole number to at least this shorter side
 
 
@@ -85,8 +86,8 @@ def follow_both_ways(
     first: Image,
     second: Image,
     pixels: NDArray[np.float32],
-    return_px: float,
     *,
+    max_error_px: float = MAX_FORWARD_BACKWARD_PX,
     side_px: int = 21,
     halvings: int = 3,
     guess: NDArray[np.float32] | None = None,
@@ -95,7 +96,7 @@ def follow_both_ways(
     """Where the second gray image shows pixels (N, 2) of the first, and (N,) False where the way back leads elsewhere.
 
     Args:
-        return_px: followed back, x and y of a pixel come back within this distance, or it counts as lost.
+        max_error_px: largest forward-backward error of x and of y, px; above it a pixel counts as lost.
         side_px: side of the window that is compared.
         halvings: how often the images are halved; it bounds the motion that is found.
         guess: (N, 2) where to start in the second image; without it at `pixels`.
@@ -110,5 +111,5 @@ def follow_both_ways(
     there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, pixels, start, **options)
     home = None if guess is None else pixels + there - guess
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, home, **options)
-    kept = (found & found_back).ravel().astype(bool) & (np.abs(back - pixels).max(1) < return_px)
+    kept = (found & found_back).ravel().astype(bool) & (np.abs(back - pixels).max(1) < max_error_px)
     return there, kept

@@ -26,7 +26,6 @@ STARTS = 10  # Number of frames from which corners are followed
 REACH = 24  # ... over so many frames at most ...
 FAR = 0.05  # ... or until they have moved by this share of the image width (median).
 MAX_CORNERS, FEWEST = 200, 40
-RETURN_PX = 1.0
 EDGE_STEP = 0.05  # No corners where depth changes by more than this share between neighbors
 LEAST_PX = 1.0  # Errors below this, px of an image 640 px wide, come from corners and tissue: nothing is wrong
 AS_GOOD = 1.15  # Conventions whose errors differ by less than this factor are not told apart
@@ -215,7 +214,7 @@ def _follow(view: Callable[[int], RgbdFrame], matrix: NDArray, start: int, count
         following, tissue, _ = view(index)
         if len(kept) < FEWEST:
             return None
-        there, good = follow_both_ways(gray, following, pixels, RETURN_PX)
+        there, good = follow_both_ways(gray, following, pixels)
         good &= _sampled(tissue, there) > 0
         if good.sum() < FEWEST:
             break

@@ -64,7 +64,7 @@ def flow_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     corners = before.corners
     if len(corners) < FEWEST:
         return None
-    there, good = follow_both_ways(before.gray, now.gray, corners, 1.0, side_px=15)
+    there, good = follow_both_ways(before.gray, now.gray, corners, side_px=15)
     return _link(corners[good], there[good], len(corners), NEAR_PX, now.gray.shape[1])
 
 

@@ -108,7 +108,7 @@ def _tool_ratio(values: NDArray, valid: Mask, tissue: Mask) -> float | None:
 
 
 LIT = 25  # Darker pixels (largest channel, 0..255) are ignored: they are outside a round border or in shadow
-LEAST_SHARE = 0.0005  # A region with a smaller share of the lit pixels counts as empty
+MIN_LIT_REGION_SHARE = 0.0005  # A region with a smaller share of the lit pixels counts as empty
 AREA_WEIGHT, BORDER_WEIGHT = 4.0, 2.0
 """Log-odds per unit of area and border: 10 % of the area gives odds of 5 : 1 for tools, 40 % gives 1.5 : 1."""
 COLOR_WEIGHT, COLOR_LIMIT = 1.5, 3.0
@@ -146,7 +146,7 @@ def mask_polarity(highs: Sequence[Mask], images: Sequence[Image]) -> Polarity:
     side, redness, at_rim = (np.concatenate(parts) for parts in (sides, reds, rims))
     inner = side[~at_rim]
     area = float(inner.mean()) if inner.size else 0.0
-    if not LEAST_SHARE < area < 1 - LEAST_SHARE:
+    if not MIN_LIT_REGION_SHARE < area < 1 - MIN_LIT_REGION_SHARE:
         value = "high" if area > 0.5 else "low"
         return Polarity(area <= 0.5, 0.0, f"almost all pixels are {value}: polarity unknown")
     border = float(side[at_rim].mean()) if at_rim.any() else 0.5

@@ -29,7 +29,7 @@ from .source import ImageFolder
 from .video_clip import Clip, FrameSelection, StereoFrame
 
 SAMPLES = 24  # number of frames used to detect borders, text, tools and lighting
-DARK, WHITE = 40.0, 230.0
+NEARLY_BLACK_LEVEL, NEARLY_WHITE_LEVEL = 40.0, 230.0
 """Images whose brightest percent of values is below the first are nearly black; darkest above the second, white."""
 Image, Mask, Depth = NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]
 
@@ -129,11 +129,11 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     lefts = [frame.left for frame in samples]
     video_notes = [*clip.notes, *_timing_notes(selection, cfg)]
     brightest = float(np.median([np.percentile(image, 99) for image in lefts]))
-    if brightest < DARK:
+    if brightest < NEARLY_BLACK_LEVEL:
         words = f"their brightest parts have {brightest:.0f} of 255. Export them brighter"
         video_notes.append(f"the images are nearly black: {words}")
     darkest = float(np.median([np.percentile(image, 1) for image in lefts]))
-    if darkest > WHITE:
+    if darkest > NEARLY_WHITE_LEVEL:
         words = f"their darkest parts have {darkest:.0f} of 255. Export them darker, or choose another part"
         video_notes.append(f"the images are nearly white: {words}")
     calibration, name, notes = clip.calibration, str(cfg.calibration), list[str]()

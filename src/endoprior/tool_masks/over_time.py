@@ -22,7 +22,7 @@ from .regions import candidate_regions, joined
 
 KEEP = 0.85  # Weight of the frame before: half a second of video at 25 frames/s
 MOST_LOG_ODDS = 6.0  # One sure frame does not outweigh all others
-COLOR_LEVELS, RETURN_PX = 15.0, 1.5
+COLOR_SCALE_LEVELS, ROUND_TRIP_SCALE_PX = 15.0, 1.5
 """Differences of color, of 255, and of flow there and back, px, at which a place counts e times less."""
 COLOR_BLUR_PX = 1.0
 CHUNK, MARGIN = 120, 24  # Frames that are decided at once, and that are known beside them: KEEP^24 is 2 %
@@ -92,8 +92,8 @@ class BidirectionalFlow:
         colors = [cv2.GaussianBlur(each.rgb_u8.astype(np.float32), (0, 0), COLOR_BLUR_PX) for each in (before, after)]
 
         def trust(here: NDArray, there: NDArray, flow: NDArray, way_back: NDArray) -> Values:
-            color = np.abs(sampled(there, grid + flow) - here).mean(-1) / COLOR_LEVELS
-            returns = np.linalg.norm(flow + sampled(way_back, grid + flow), axis=-1) / RETURN_PX
+            color = np.abs(sampled(there, grid + flow) - here).mean(-1) / COLOR_SCALE_LEVELS
+            returns = np.linalg.norm(flow + sampled(way_back, grid + flow), axis=-1) / ROUND_TRIP_SCALE_PX
             return np.exp(-(color**2) - returns**2).astype(np.float32)
 
         ahead, behind = trust(colors[0], colors[1], onward, back), trust(colors[1], colors[0], back, onward)

@@ -23,7 +23,7 @@ needle, the head of an instrument whose shaft is hidden."""
 REACH = 0.75
 """A tool enters end first: it must reach into the view by this share of the length of its contact with the border.
 At 0.5 an organ along the border passes; at 1 a thick shaft that has just entered fails."""
-LEAST_SHARE = 0.002  # Smaller regions, as a share of the view, are removed: about 25 px square at 640x512
+MIN_TOOL_REGION_SHARE = 0.002  # Smaller regions, as a share of the view, are removed: about 25 px square at 640x512
 LARGEST_HOLE = 0.01  # Holes up to this share of the view are filled: highlights, and the windows of a grasper's jaws
 RIM_PX = 2  # Pixels this near to a tool belong to it from the first level on
 OUTSIDE = -8.0  # Log-odds beyond the view
@@ -45,7 +45,7 @@ def tool_regions(log_odds: NDArray[np.float32], view: Mask) -> Mask:
 
 def candidate_regions(log_odds: NDArray[np.float32], view: Mask) -> list[Region]:
     """All regions with an outline; arguments as in `tool_regions`. In one that is no tool, smaller ones may be."""
-    smooth, least, most = _smooth(log_odds, view), LEAST_SHARE * view.sum(), LARGEST_HOLE * view.sum()
+    smooth, least, most = _smooth(log_odds, view), MIN_TOOL_REGION_SHARE * view.sum(), LARGEST_HOLE * view.sum()
     probability = 1 / (1 + np.exp(-smooth))
 
     def regions(mask: Mask, level: int) -> list[Region]:
@@ -96,7 +96,7 @@ def entering_regions(mask: NDArray, view: Mask) -> Mask:
         box = np.s_[y : y + height, x : x + width]
         region = labels[box] == i
         contact = region & (inward[box] <= 3)
-        if i == 0 or area < LEAST_SHARE * view.sum() or not contact.any():
+        if i == 0 or area < MIN_TOOL_REGION_SHARE * view.sum() or not contact.any():
             continue
         # A tool that crosses the view touches the border twice; use the longer contact.
         pieces = components(contact)[1][1:]

@@ -31,7 +31,7 @@ STRETCH = 50
 """At most one frame is prompted in each stretch of so many frames: a tool that enters later is found there."""
 RIM_SHARE = 1 / 320
 """Width of the rim that found tools have around them, as a share of the image width: 2 px of 640."""
-LEAST_SHARE = 0.002  # Smaller regions, as a share of the image, prompt nothing
+MIN_PROMPT_REGION_SHARE = 0.002  # Smaller regions, as a share of the image, prompt nothing
 MOST_REGIONS = 6  # Of one frame, the largest first. Each is an object of its own, which takes memory and time
 COVERED = 0.1  # A region with at least this share inside masks that were carried before is not new
 
@@ -187,7 +187,7 @@ def sure_regions(mask: Mask, covered: Mask | None = None) -> list[Mask]:
     labels, boxes = components(cv2.erode(mask.astype(np.uint8), disk(rim_px(mask.shape[1]))) > 0)
     areas = boxes[:, AREA]
     order = sorted(range(1, len(areas)), key=lambda i: (-areas[i], i))
-    large = [labels == i for i in order if areas[i] >= LEAST_SHARE * mask.size]
+    large = [labels == i for i in order if areas[i] >= MIN_PROMPT_REGION_SHARE * mask.size]
     if covered is not None:
         large = [region for region in large if covered[region].mean() < COVERED]
     return large[:MOST_REGIONS]

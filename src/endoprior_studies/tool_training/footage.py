@@ -31,7 +31,7 @@ LONG_SIDE_PX = 420
 """Training frames are held at this size: parts of them become examples of 256 px."""
 TOOL_FREE = range(97, 148)
 """Frames of `mono_endo` without a tool."""
-DARK, DARK_PX = 25, 25
+ROUND_BORDER_LEVEL, MIN_ROUND_BORDER_PX = 25, 25
 """Largest level and least width of what is black around a round image."""
 EYE_PX = 81
 """Size of the square around each pixel of a tool in which `cataract1k` tells what is none, px."""
@@ -102,8 +102,8 @@ def _without_tools(path: Path, wanted: range) -> Iterator[Labeled]:
         for i, picture in enumerate(container.decode(video=0)):
             if i in wanted:
                 image = np.asarray(picture.to_ndarray(format="rgb24"), np.uint8)
-                kernel = np.ones((DARK_PX, DARK_PX), np.uint8)
-                dark = cv2.morphologyEx((image.max(-1) < DARK).astype(np.uint8), cv2.MORPH_OPEN, kernel)
+                kernel = np.ones((MIN_ROUND_BORDER_PX, MIN_ROUND_BORDER_PX), np.uint8)
+                dark = cv2.morphologyEx((image.max(-1) < ROUND_BORDER_LEVEL).astype(np.uint8), cv2.MORPH_OPEN, kernel)
                 yield f"{path.stem} {i}", image, np.where(dark > 0, IGNORED, 0).astype(np.uint8)
 
 

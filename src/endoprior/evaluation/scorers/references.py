@@ -59,11 +59,10 @@ MEAN_FRAMES = 60  # training frames in the mean image
 STARTS, AHEAD, GRID = 6, 12, 16
 """Frames from which points are followed, for so many frames, and the number of points along the wider side."""
 HALF = np.float32(0.5)  # OpenCV counts pixels from the center of the first one, we from its edge
-RETURN_PX = 1.0  # a point that comes back by less is followed rightly
 REFERENCE_WIDTH_PX = 640
 LEAST_ANGLE = math.radians(1.5)  # rays that meet at a smaller angle do not tell depth
 MOST_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, are not of one resting point
-LEAST_POINTS, LEAST_SHARE = 40, 0.1
+MIN_TRACKED_POINTS, MIN_TRACKED_SHARE = 40, 0.1
 """Least number of points that a score rests on, and their share of all that lie on tissue: a few beside a dark tube do
 not speak for its depth."""
 RELIEF_POINTS, LEAST_RELIEF = 100, 0.03
@@ -164,9 +163,9 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
         ("depth_triangulated_error", errors, f"{STANDS}, or {FEW_POINTS}"),
     ):
         found = np.concatenate(values) if values else np.zeros(0)
-        enough = len(found) >= max(LEAST_POINTS, LEAST_SHARE * tried)
+        enough = len(found) >= max(MIN_TRACKED_POINTS, MIN_TRACKED_SHARE * tried)
         context.add(name, float(np.median(found)) if enough else math.nan, why)
-    relief = relief_agreement(np.concatenate(reliefs, 1) if reliefs else np.zeros((2, 0)), LEAST_SHARE * tried)
+    relief = relief_agreement(np.concatenate(reliefs, 1) if reliefs else np.zeros((2, 0)), MIN_TRACKED_SHARE * tried)
     context.add("depth_relief", relief, f"{STANDS}, the tissue is flat, or {FEW_POINTS}")
 
 
@@ -205,7 +204,7 @@ def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
     for index in range(first + 1, first + ahead + 1):
         before, frame = frame, sequence.frame(index)
         following = gray_for_flow(frame.rgb_u8, 1)
-        there, returned = follow_both_ways(gray, following, now, RETURN_PX)
+        there, returned = follow_both_ways(gray, following, now)
         step = align(gray, following, before.tissue_mask, frame.tissue_mask)
         if step is not None:
             returned &= ~stuck(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)

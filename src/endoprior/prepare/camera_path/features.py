@@ -32,7 +32,6 @@ COARSE_FLAT_WIDTHS, BLUR_WIDTHS = 28, 160
 """Where corners are few, detail between blurs of width / 160 and width / 28 px is followed: finer patterns of sensor or
 fibers stay where they are while the view moves."""
 GUESS_PX = 10.0  # parallax: a corner is this far from where the image as a whole goes, px of an image 640 px wide
-RETURN_PX = 1.0  # followed to the next frame and back, a corner returns within this distance
 KEYPOINTS = 600
 RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
 FEWEST_INLIERS = 20  # fewer matches that one pose explains may be chance
@@ -120,9 +119,9 @@ def followed(before: TrackingFrame, now: TrackingFrame, pixels: NDArray) -> tupl
     """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
-    near, good = follow_both_ways(before.plain, now.plain, pixels, RETURN_PX, halvings=COARSE_HALVINGS)
+    near, good = follow_both_ways(before.plain, now.plain, pixels, halvings=COARSE_HALVINGS)
     there, still_good = follow_both_ways(
-        before.flat, now.flat, pixels, RETURN_PX, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
+        before.flat, now.flat, pixels, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
     )
     good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
@@ -141,7 +140,6 @@ def followed_directly(before: TrackingFrame, now: TrackingFrame, pixels: NDArray
         before.flat,
         now.flat,
         pixels,
-        RETURN_PX,
         side_px=31,
         halvings=FINE_HALVINGS,
         guess=guess,
