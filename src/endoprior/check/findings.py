@@ -16,8 +16,8 @@ from ..core.shell import command
 from ..data.description import MOTION, SIZE_NOT_STATED
 from ..data.image_folders import ways_to_prepare
 from ..footage.camera_motion import MOVING_FRACTION
+from ..footage.depth_unit import FAR_MM
 from ..footage.disturbances import DARK_MEAN_GRAY
-from ..footage.units import FAR_MM
 from ..model.presets import preset
 from .errors import scene_cuts, swapped_eyes, swapped_masks, wrong_poses, wrong_unit
 from .facts import Facts

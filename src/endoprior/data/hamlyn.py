@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import DataConfig
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Camera
 from ..footage.border import find_outside
 from .assemble import Pixels, assemble, kept_frames
@@ -75,7 +75,7 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     kept = kept_frames(len(images), cfg, having=columns)
     images = [images[i] for i in kept]
     depths, *masks = ([files[i] for i in kept] for files in columns)
-    margin = find_outside([read_color(images[i], size)[:, crop:] for i in spread(len(images), SAMPLES)]).mask
+    margin = find_outside([read_color(images[i], size)[:, crop:] for i in evenly_spaced(len(images), SAMPLES)]).mask
     if margin.any():
         remarks.append(f"{path}: a black margin, {margin.mean():.0%} of a frame, is no tissue")
 

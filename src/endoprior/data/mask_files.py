@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..footage.units import Polarity, mask_polarity
+from ..footage.mask_polarity import Polarity, mask_polarity
 from .images import Size, decode_image
 from .reading import read_only_array
 

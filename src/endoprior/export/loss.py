@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .. import render
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Splats
 from ..model.scene import Scene
 from .axes import ROTATIONS, rotated
@@ -29,7 +29,7 @@ def loss_note(scene: Scene, out: Path, options: ExportOptions, chosen: ExportFor
     if chosen.read is None:
         return ""
     steps = selected_time_steps(scene, options)
-    some = [steps[k] for k in spread(len(steps), MOST_FRAMES)]
+    some = [steps[k] for k in evenly_spaced(len(steps), MOST_FRAMES)]
     back = ROTATIONS[options.frame or chosen.default_axes].T
     errors = []
     for step in some:

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..core.checks import input_error
 from ..core.geometry import back_project, length_unit, pixel_centers, project
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Camera
 from ..model.scene import Scene
 from ..model.surface import Surface, render_surface
@@ -183,7 +183,7 @@ def viewpoints(cameras: tuple[Camera, ...]) -> list[Camera]:
     different = list(kept.values())
     if len(different) < 2:
         raise input_error("--mesh-method tsdf", "several camera positions", "one", "use --mesh-method grid.")
-    return [different[i] for i in spread(len(different), MAX_VIEWS)]
+    return [different[i] for i in evenly_spaced(len(different), MAX_VIEWS)]
 
 
 def fused_mesh(views: list[Surface], voxel_mm: float) -> Mesh:

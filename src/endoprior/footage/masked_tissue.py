@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from .background_motion import difference_from_background
 from .components import AREA, Image, InOrder, Mask, components, disk, distance_inside
 from .optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
@@ -46,7 +46,7 @@ def find_masked_tissue(
         each: as `map`; threads can give the results, in order.
     """
     ahead = max(1, round(MOTION_S * frames_per_second))
-    first = spread(count - ahead, COMPARED) if count > ahead else []
+    first = evenly_spaced(count - ahead, COMPARED) if count > ahead else []
     found = list(each(lambda i: _likest(color(i), color(i + ahead), tool(i), tool(i + ahead)), first))
     moving = [(i, ratio, place) for i, (speed, ratio, place) in zip(first, found, strict=True) if speed > MOVES_PX]
     alike = [(i, place) for i, ratio, place in moving if ratio < WITH_TISSUE]

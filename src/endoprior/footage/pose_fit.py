@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry import CONVENTIONS, Convention, to_ours
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from .components import Image, InOrder, square
 from .optical_flow import follow_both_ways
 
@@ -147,7 +147,7 @@ def measure_poses(
     factor = min(1.0, WORK_WIDTH / width)
     px = 640 / (factor * width)
     matrix = np.diag([factor, factor, 1]) @ matrix + [[0, 0, (factor - 1) / 2], [0, 0, (factor - 1) / 2], [0, 0, 0]]
-    starts = spread(len(poses) - 1, STARTS)
+    starts = evenly_spaced(len(poses) - 1, STARTS)
 
     def follow(start: int) -> _Tracks | None:
         return _follow(lambda j: _small(view(j), factor), matrix, start, len(poses))

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..footage.background_motion import difference_from_background
 from ..footage.components import InOrder
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
@@ -48,7 +48,7 @@ def frames_with_unmasked_motion(
         each: as `map`; threads can give the results, in order.
     """
     ahead = max(1, round(MOTION_S * frames_per_second))
-    compared = spread(count - ahead, COMPARED) if count > ahead else []
+    compared = evenly_spaced(count - ahead, COMPARED) if count > ahead else []
 
     def moves(i: int) -> bool:
         # What a tool covers or uncovers has no flow: it counts as masked where the tool is in either frame.

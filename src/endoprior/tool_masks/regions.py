@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.components import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, components, disk, grown, regions_where
+from ..footage.components import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, components, dilated, disk, regions_where
 
 LEVELS = np.arange(-0.6, 4.01, 0.5)  # of the log-odds, at which regions may end: probabilities from 0.35 to 0.98
 STABLE = 0.8  # Share of a region that the next level leaves of one with an outline
@@ -75,7 +75,7 @@ def candidate_regions(log_odds: NDArray[np.float32], view: Mask) -> list[Region]
 def joined(masks: list[Mask], log_odds: NDArray[np.float32], view: Mask) -> Mask:
     """(h, w) the union of regions, with their rims."""
     union = np.any([np.zeros_like(view), *masks], axis=0)
-    rim = (_smooth(log_odds, view) > LEVELS[0]) & grown(union, disk(RIM_PX))
+    rim = (_smooth(log_odds, view) > LEVELS[0]) & dilated(union, disk(RIM_PX))
     return filled(union | rim, LARGEST_HOLE * view.sum()) & view
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..data.found_tools import FoundTools
@@ -30,7 +30,7 @@ def find_in_sequence(
     and the tools of the frame. `refine` only adds pixels to the sequence's masks, in regions that touch them.
     """
     total, finder = len(sequence), ToolFinder()
-    view = view_of([sequence.frame(i) for i in spread(total, SAMPLES)])
+    view = view_of([sequence.frame(i) for i in evenly_spaced(total, SAMPLES)])
     images = (sequence.frame(i).rgb_u8 for i in range(total))
     for i, small in enumerate(finder.find_over_time(images, view)):
         frame, found = sequence.frame(i), replace(small, mask=full_size(small.mask, view.shape) & view)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..data import FrameSequence
 from ..data.found_tools import FoundTools
-from ..footage.components import AREA, Image, Mask, components, disk, grown
+from ..footage.components import AREA, Image, Mask, components, dilated, disk
 from .mask_store import MaskStore, read_state, write_state
 from .sequence import Progress, find_in_sequence, no_progress
 
@@ -195,7 +195,7 @@ def sure_regions(mask: Mask, covered: Mask | None = None) -> list[Mask]:
 
 def with_rim(mask: Mask) -> Mask:
     """(H, W) a carried mask with the rim that `sure_regions` takes off: color of a tool bleeds over its edge."""
-    return grown(mask, disk(rim_px(mask.shape[1])))
+    return dilated(mask, disk(rim_px(mask.shape[1])))
 
 
 def carry(

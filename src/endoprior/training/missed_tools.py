@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..system.memory import BoundedCache, cache_bytes
 from ..tool_masks import ToolFinder
@@ -85,7 +85,7 @@ class MaskDoubt:
 
     def __init__(self, sequence: FrameSequence) -> None:
         indices = sequence.indices("train")
-        frames = [sequence.frame(indices[k]) for k in spread(len(indices), SAMPLES)]
+        frames = [sequence.frame(indices[k]) for k in evenly_spaced(len(indices), SAMPLES)]
         self._sequence, self._view = sequence, view_of(frames)
         self._finder = ToolFinder()
         height, width = self._view.shape

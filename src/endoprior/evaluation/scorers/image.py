@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...footage.components import Mask
 from ..score import Score, ScoreUnavailable
 
@@ -82,7 +82,7 @@ def compute(context: EvaluationContext) -> None:
             raise ScoreUnavailable("the split is that of training")
         context.reject_slow_frames()
         trained = context.sequence.frames("train")
-        chosen = [trained[k] for k in spread(len(trained), TRAINING_FRAMES)]
+        chosen = [trained[k] for k in evenly_spaced(len(trained), TRAINING_FRAMES)]
         values = [psnr_tissue(context.rendered[f.index].rgb, f.rgb, f.tissue_mask) for f in chosen]
         context.add_mean("psnr_train", values, "no tissue in training frames")
     with context.skip_if_unavailable("seam_psnr"):

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.geometry import back_project, project
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...core.types import Camera, Frame
 from ...data import FrameList, FrameSequence
 from ...footage.alignment import align
 from ...footage.components import Mask
-from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_both_ways, gray_for_flow, stuck
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, follow_both_ways, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
@@ -97,7 +97,7 @@ def _image_references(context: EvaluationContext) -> None:
 
 def mean_image(frames: FrameList) -> NDArray[np.float32]:
     """(H, W, 3) mean color in [0, 1] of up to `MEAN_FRAMES` frames over their tissue; of all pixels where none is."""
-    chosen = [frames[k] for k in spread(len(frames), MEAN_FRAMES)]
+    chosen = [frames[k] for k in evenly_spaced(len(frames), MEAN_FRAMES)]
     weight, tissue, every = np.zeros_like(chosen[0].rgb[..., :1]), *np.zeros((2, *chosen[0].rgb.shape), np.float32)
     for frame in chosen:
         mask = frame.tissue_mask[..., None]
@@ -135,7 +135,7 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
     sequence = context.sequence
     ahead = min(AHEAD, len(sequence) - 1)
     slips, errors, reliefs, tried = list[NDArray](), list[NDArray](), list[NDArray](), 0
-    starts = spread(len(sequence) - ahead, STARTS)
+    starts = evenly_spaced(len(sequence) - ahead, STARTS)
     with frame_threads(BYTES_PER_PX * sequence.frame(0).tissue_mask.size) as pool:
         paths = list(pool.map(lambda k: follow(sequence, k, ahead), starts))
     for k, followed in zip(starts, paths, strict=True):
@@ -207,7 +207,7 @@ def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
         there, returned = follow_both_ways(gray, following, now)
         step = align(gray, following, before.tissue_mask, frame.tissue_mask)
         if step is not None:
-            returned &= ~stuck(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)
+            returned &= ~fixed_in_image(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)
         kept &= returned & shown_pixels(there + HALF, frame.tissue_mask)
         gray, now = following, there
     return Followed(start[kept] + HALF, now[kept] + HALF, tried)

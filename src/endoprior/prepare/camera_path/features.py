@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...footage.alignment import align
-from ...footage.optical_flow import follow_both_ways, stuck
+from ...footage.optical_flow import fixed_in_image, follow_both_ways
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
 from .tracks import PoseInput, TrackingCamera
@@ -146,7 +146,7 @@ def followed_directly(before: TrackingFrame, now: TrackingFrame, pixels: NDArray
         criteria=FINE_CRITERIA,
     )
     px = now.flat.shape[1] / 640
-    good &= ~stuck(there - pixels, guess - pixels, now.flat.shape[1])
+    good &= ~fixed_in_image(there - pixels, guess - pixels, now.flat.shape[1])
     good &= (np.linalg.norm(there - guess, axis=1) < GUESS_PX * px) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
     return kept, there[kept]

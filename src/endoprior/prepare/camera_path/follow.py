@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...system.parallel import frame_threads
 from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
 from .features import (
@@ -141,7 +141,7 @@ class Follower:
         new = keyframe(index, self._view)
         others = [old for old in self.keyframes if self.segment[old.frame] != self.segment[index]]
         self.keyframes.append(new)
-        tried = [*others[-RECENT:], *(others[i] for i in spread(max(len(others) - RECENT, 0), OLDER))]
+        tried = [*others[-RECENT:], *(others[i] for i in evenly_spaced(max(len(others) - RECENT, 0), OLDER))]
         links = [
             (match_keyframe(self.lens, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried
         ]

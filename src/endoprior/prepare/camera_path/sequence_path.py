@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error, number_ranges
 from ...core.geometry import Convention, length_unit, to_ours
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...core.shell import install_command
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import SHOWN, CameraMotion
@@ -270,7 +270,7 @@ def _deeper(
     shape = fitted_shape(path, follower, cosine) if path.motion and path.motion.drives else None
     if shape is None:
         posed = np.flatnonzero(path.explained)
-        shape = shape_by_light((frame(int(posed[i])) for i in spread(len(posed), LIT_FRAMES)), cosine)
+        shape = shape_by_light((frame(int(posed[i])) for i in evenly_spaced(len(posed), LIT_FRAMES)), cosine)
     if shape is None:
         return path, follower
     new, tracks = path, follower
