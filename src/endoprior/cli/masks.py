@@ -89,7 +89,7 @@ class Masks(Command):
                 found = segment_sequence(sequence, segmenter, work, refine=self.refine, progress=progress)
             for i, (mask, tools) in enumerate(found):
                 rows.append(FrameRow.of(i, tools))
-                put(i, mask, tools.mask, f"{rows[i].share:.1%}")
+                put(i, mask, tools.tool_mask, f"{rows[i].share:.1%}")
         write_rows(self.data, rows)
         count = sum(row.share > 0 for row in rows)
         note_found_masks(self.data, count / len(rows), segmenter.name if segmenter else "")

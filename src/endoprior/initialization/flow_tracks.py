@@ -157,7 +157,7 @@ def _composed(first: Flow, second: Flow) -> NDArray[np.float32]:
 
 def _add_tracks(
     flow: AnchorFlow,
-    masks: Sequence[NDArray[np.bool_]],
+    tissue_masks: Sequence[NDArray[np.bool_]],
     sources: NDArray[np.float64],
     origins: NDArray[np.integer],
     limit_px: float,
@@ -167,11 +167,11 @@ def _add_tracks(
     """Follow all points by way of one anchor; update `pixels` (T, N, 2) where the `error` (T, N), px, gets smaller.
 
     Args:
-        masks: (H, W) tissue of each frame. sources: (N, 2) px in the frames `origins` (N,).
+        tissue_masks: (H, W) tissue of each frame. sources: (N, 2) px in the frames `origins` (N,).
     """
 
     def followed(points: NDArray, there: Flow, back: Flow, frame: int) -> tuple[NDArray, NDArray]:
-        return follow(points, there.astype(np.float32), back.astype(np.float32), masks[frame])
+        return follow(points, there.astype(np.float32), back.astype(np.float32), tissue_masks[frame])
 
     there, back = flow.there, flow.back
     at_anchor, first_step = np.full_like(sources, np.nan), np.full(len(sources), np.inf)

@@ -90,7 +90,7 @@ def choose_methods(
     if relative:
         images, usable = (
             [f.rgb_u8 for f in samples],
-            [geometry.inside & ~tools(f.index).mask & ~first_pass.hidden(f.index, f.rgb_u8) for f in samples],
+            [geometry.inside & ~tools(f.index).tool_mask & ~first_pass.hidden(f.index, f.rgb_u8) for f in samples],
         )
         if measure is None:
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
@@ -289,7 +289,7 @@ def write_frames(
         depth = frame.depth
         if methods.filter_in_time:
             depth = temporal_median([other.depth for other in window if other.depth is not None])
-        tools = methods.tools(frame.index).mask | ~geometry.inside | methods.hidden(frame.index, frame.rgb_u8)
+        tools = methods.tools(frame.index).tool_mask | ~geometry.inside | methods.hidden(frame.index, frame.rgb_u8)
         if methods.shade:
             depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:

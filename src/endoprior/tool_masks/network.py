@@ -230,7 +230,7 @@ class ToolFinder:
             return Look(np.asarray(shrunk, np.uint8), self.log_odds(rgb_u8, view))
 
         for tools in decide_over_time(each(look, images), small):
-            yield FoundTools(tools.mask, _confidence(tools.mask, tools.log_odds, small))
+            yield FoundTools(tools.tool_mask, _confidence(tools.tool_mask, tools.log_odds, small))
 
 
 def _confidence(mask: Mask, log_odds: NDArray[np.float32], view: Mask) -> float:

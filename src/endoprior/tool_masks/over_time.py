@@ -43,7 +43,7 @@ class Look:
 class SmallTools:
     """The tools of one frame at the network's size."""
 
-    mask: Mask  # (h, w)
+    tool_mask: Mask  # (h, w)
     log_odds: Values  # (h, w) carried over time
 
 

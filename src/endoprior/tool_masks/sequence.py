@@ -33,14 +33,14 @@ def find_in_sequence(
     view = view_of([sequence.frame(i) for i in evenly_spaced(total, SAMPLES)])
     images = (sequence.frame(i).rgb_u8 for i in range(total))
     for i, small in enumerate(finder.find_over_time(images, view)):
-        frame, found = sequence.frame(i), replace(small, mask=full_size(small.mask, view.shape) & view)
+        frame, found = sequence.frame(i), replace(small, tool_mask=full_size(small.tool_mask, view.shape) & view)
         if refine:
             given = ~frame.tissue_mask & view
-            labels, boxes = components(given | found.mask)
+            labels, boxes = components(given | found.tool_mask)
             touches = np.isin(np.arange(len(boxes)), labels[given])
             found = FoundTools(regions_where(touches, labels), found.confidence)
         progress("finding tools", i + 1, total)
-        yield found.mask | ~view, found
+        yield found.tool_mask | ~view, found
 
 
 def view_of(frames: Sequence[Frame]) -> Mask:

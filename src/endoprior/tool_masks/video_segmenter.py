@@ -105,8 +105,8 @@ class _Clip:
             return
         confidence = []
         for i, (mask, found) in enumerate(find_in_sequence(self.sequence, refine=refine, progress=progress)):
-            self.found.put(i, found.mask)
-            self.outside.add(0, mask & ~found.mask)  # the border of the view, one for the clip
+            self.found.put(i, found.tool_mask)
+            self.outside.add(0, mask & ~found.tool_mask)  # the border of the view, one for the clip
             confidence.append(float(found.confidence))
         self._note(confidence=confidence)
 
@@ -179,23 +179,23 @@ def rim_px(width: int) -> int:
     return max(1, round(width * RIM_SHARE))
 
 
-def sure_regions(mask: Mask, covered: Mask | None = None) -> list[Mask]:
+def sure_regions(tool_mask: Mask, covered: Mask | None = None) -> list[Mask]:
     """The connected regions of a tool mask (H, W) without its rim, the largest first, at most `MOST_REGIONS`; without
     those that lie in `covered`, tools that are known already.
     """
     # The image's edge is not an edge of the tool: nothing is taken off there.
-    labels, boxes = components(cv2.erode(mask.astype(np.uint8), disk(rim_px(mask.shape[1]))) > 0)
+    labels, boxes = components(cv2.erode(tool_mask.astype(np.uint8), disk(rim_px(tool_mask.shape[1]))) > 0)
     areas = boxes[:, AREA]
     order = sorted(range(1, len(areas)), key=lambda i: (-areas[i], i))
-    large = [labels == i for i in order if areas[i] >= MIN_PROMPT_REGION_SHARE * mask.size]
+    large = [labels == i for i in order if areas[i] >= MIN_PROMPT_REGION_SHARE * tool_mask.size]
     if covered is not None:
         large = [region for region in large if covered[region].mean() < COVERED]
     return large[:MOST_REGIONS]
 
 
-def with_rim(mask: Mask) -> Mask:
+def with_rim(tool_mask: Mask) -> Mask:
     """(H, W) a carried mask with the rim that `sure_regions` takes off: color of a tool bleeds over its edge."""
-    return dilated(mask, disk(rim_px(mask.shape[1])))
+    return dilated(tool_mask, disk(rim_px(tool_mask.shape[1])))
 
 
 def carry(

@@ -81,7 +81,7 @@ def score_set(finder: ToolFinder, frames: Iterable[TestFrame]) -> SetScore:
     """Find the tools of each frame, and compare."""
     total, seen = Counts(), []
     for frame in frames:
-        found = finder.find(frame.rgb_u8, frame.view).mask
+        found = finder.find(frame.rgb_u8, frame.view).tool_mask
         counts = count(found, frame)
         total += counts
         seen.append((counts.core_missed + counts.false, frame, found))

@@ -154,12 +154,12 @@ def phantom_sets() -> dict[str, tuple[PhantomConfig, ...]]:
 
 def phantom_frames(folder: Path, phantoms: tuple[PhantomConfig, ...]) -> Iterator[TestFrame]:
     """The frames of some phantoms; written to `folder` once."""
-    for config in phantoms:
-        place = folder / f"{config.instruments}_{config.tissue}"
+    for cfg in phantoms:
+        place = folder / f"{cfg.instruments}_{cfg.tissue}"
         if not place.exists():
-            write_phantom(place, config)
-        for i in range(config.frames):
+            write_phantom(place, cfg)
+        for i in range(cfg.frames):
             tools = read_tool_mask(place / "masks" / f"{i:06d}.png")
             whole = np.ones_like(tools)
             image = read_color(place / "images" / f"{i:06d}.png")
-            yield TestFrame(f"{config.instruments} on {config.tissue} {i}", image, whole, tools, whole)
+            yield TestFrame(f"{cfg.instruments} on {cfg.tissue} {i}", image, whole, tools, whole)
