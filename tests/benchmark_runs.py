@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from endoprior_studies.execute import Outcome
-from endoprior_studies.worker import Job, work
+from endoprior_studies.worker import CellJob, work
 
 
-def in_this_process(jobs: list[Job]) -> Iterator[Outcome]:
+def in_this_process(jobs: list[CellJob]) -> Iterator[Outcome]:
     """An executor: one job after the other."""
     for job in jobs:
         work(job)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from endoprior.prepare.camera_path.tracks import Lens, PoseInput
+from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
@@ -23,7 +23,7 @@ TEXTURE = smooth(900, 900, sigma=2.5)
 
 
 def lens(relative=False, baseline_mm=4.0):
-    return Lens.centered_at_half(MATRIX, WIDTH, relative, None if relative else baseline_mm)
+    return TrackingCamera.centered_at_half(MATRIX, WIDTH, relative, None if relative else baseline_mm)
 
 
 def height(x, y):

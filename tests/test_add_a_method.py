@@ -27,7 +27,7 @@ from endoprior.evaluation.scoring import evaluate
 from endoprior.model.method import METHODS, config_from, method_named, method_of
 from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import load_scene
-from endoprior.model.single_scene import FORMAT
+from endoprior.model.single_scene import SCENE_FORMAT
 from endoprior.runs.train import train
 from endoprior.system.arrays_file import save_arrays
 from endoprior_studies.spec_file import load_spec
@@ -159,7 +159,7 @@ def test_a_wrong_loss_is_one_line_with_a_fix_that_its_author_can_follow(tiny_seq
 
 def test_a_scene_whose_plugin_is_missing_names_what_to_install(tmp_path):
     about = {"config": {"method": "elsewhere"}}
-    save_arrays(tmp_path / "scene.safetensors", {"x": torch.zeros(1)}, about, FORMAT)
+    save_arrays(tmp_path / "scene.safetensors", {"x": torch.zeros(1)}, about, SCENE_FORMAT)
     with pytest.raises(InputError) as caught:
         load_scene(tmp_path)
     said = str(caught.value)

@@ -12,10 +12,10 @@ from endoprior.evaluation.scorers.camera_path import trajectory_errors
 from endoprior.footage.alignment import align, mean_shift
 from endoprior.footage.camera_motion import camera_motion
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.prepare.camera_path.features import followed, followed_directly, new_corners, view_of
+from endoprior.prepare.camera_path.features import followed, followed_directly, new_corners, tracking_frame
 from endoprior.prepare.camera_path.kind import path_motion
 from endoprior.prepare.camera_path.sequence_path import path_depth, sequence_path
-from endoprior.prepare.camera_path.tracks import CameraPath, Lens, PoseInput, Tracks
+from endoprior.prepare.camera_path.tracks import CameraPath, PoseInput, TrackingCamera, Tracks
 from endoprior.prepare.relative_depth import fit_shading
 
 SIZE = 320, 240
@@ -72,7 +72,7 @@ def test_static_is_said_only_where_it_was_shown():
 def test_an_unknown_motion_claims_no_poses(rests):
     images = [color(soft(1))] * rests + [color(soft(k)) for k in range(20, 32)]
     everything, depth = np.ones(SIZE[::-1], bool), np.full(SIZE[::-1], 70, np.float32)
-    lens = Lens(np.array([[230.0, 0, 160], [0, 230.0, 120], [0, 0, 1]]), SIZE[0], True)
+    lens = TrackingCamera(np.array([[230.0, 0, 160], [0, 230.0, 120], [0, 0, 1]]), SIZE[0], True)
     path, notes = sequence_path(
         "auto-own",
         lambda k: PoseInput(images[k], everything, depth),
@@ -90,7 +90,7 @@ def test_what_stays_on_the_lens_is_not_followed_where_corners_are_few():
     for shift in (0.0, 6.0):
         gray = np.clip(128 + 0.15 * (shifted(soft(1, 6.0), (shift, 0))[0] - 128.0) + pattern, 0, 255).astype(np.uint8)
         seen = PoseInput(color(gray), np.ones(SIZE[::-1], bool), np.full(SIZE[::-1], 70, np.float32))
-        views.append([view_of(seen), view_of(seen, coarse=True)])
+        views.append([tracking_frame(seen), tracking_frame(seen, coarse=True)])
     fine, coarse = zip(*views, strict=True)
     none = np.zeros((0, 2), np.float32)
     corners = new_corners(fine[0], none)
@@ -109,7 +109,7 @@ def test_a_border_does_not_hold_corners_where_they_are():
     for shift in (0.0, 4.0):
         gray = 70 + 0.5 * (shifted(soft(1), (shift, 0))[0] - 128.0) + 30 * x / SIZE[0]
         image = np.where(tissue, gray, 0).astype(np.uint8)
-        views.append(view_of(PoseInput(color(image), tissue, np.full(SIZE[::-1], 70, np.float32))))
+        views.append(tracking_frame(PoseInput(color(image), tissue, np.full(SIZE[::-1], 70, np.float32))))
     corners = new_corners(views[0], np.zeros((0, 2), np.float32))
     kept, there = followed(*views, corners)
     way = there[:, 0] - corners[kept][:, 0]
@@ -121,7 +121,7 @@ def path_of(step, turn_degrees=0.0):
     pose, motion = np.eye(4), np.eye(4)
     motion[:3, :3], motion[:3, 3] = cv2.Rodrigues(np.deg2rad([0, turn_degrees, 0]))[0], step
     poses = [pose := pose @ motion for _ in range(20)]
-    lens = Lens(np.array([[230.0, 0, 160], [0, 230.0, 120], [0, 0, 1]]), SIZE[0], True)
+    lens = TrackingCamera(np.array([[230.0, 0, 160], [0, 230.0, 120], [0, 0, 1]]), SIZE[0], True)
     tracks = Tracks(lens)
     ids = tracks.add_points(np.zeros((1, 3)), keypoint=False)
     for frame in range(20):
@@ -150,7 +150,8 @@ def test_path_and_depth_in_a_tube_are_right_to_five_percent(tmp_path):
     matrix = np.array([[cfg.focal, 0, cfg.center[0]], [0, cfg.focal, cfg.center[1]], [0, 0, 1]])
     path, _ = sequence_path(
         "auto-own", seen.__getitem__, lambda: (images, [everything] * 48), 48,
-        Lens.centered_at_half(matrix, cfg.width, True), (cfg.width, cfg.height), has_depth=True, refine_focal=False,
+        TrackingCamera.centered_at_half(matrix, cfg.width, True), (cfg.width, cfg.height), has_depth=True,
+        refine_focal=False,
     )  # fmt: skip
     true = np.load(tmp_path / "data/truth/camera_to_world.npy")
     assert path is not None and path.explained.all() and path.kind == "forward"

@@ -12,11 +12,11 @@ from endoprior.prepare.camera_path import colmap
 from endoprior.prepare.camera_path import sequence_path as paths
 from endoprior.prepare.camera_path.adjust import back_projected
 from endoprior.prepare.camera_path.breathing import breathing_period
-from endoprior.prepare.camera_path.features import new_corners, sampled, view_of
+from endoprior.prepare.camera_path.features import new_corners, sampled, tracking_frame
 from endoprior.prepare.camera_path.own import own_path
 from endoprior.prepare.camera_path.pose_file import read_poses
 from endoprior.prepare.camera_path.sequence_path import explained_share, find_path, sequence_path
-from endoprior.prepare.camera_path.tracks import Lens, PoseInput
+from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
 
 SIZE = (WIDTH, HEIGHT)
 OPENCV = lens().matrix
@@ -145,7 +145,7 @@ def test_corners_keep_off_edges_tools_and_each_other(relief):
     depth[:, 100:] += 30
     seen = PoseInput(seen.rgb_u8, mask, depth)
     taken = np.array([[70.0, 60.0]], np.float32)
-    corners = new_corners(view_of(seen), taken)
+    corners = new_corners(tracking_frame(seen), taken)
     assert len(corners) > 20 and corners[:, 0].min() > 42
     assert (np.abs(corners[:, 0] - 99.5) > 1).all()
     assert np.hypot(*(corners - taken).T).min() >= 4
@@ -262,7 +262,7 @@ def test_the_principal_point_may_lie_at_the_edge_of_the_image():
     part = np.s_[:, 80:]
     cropped = [PoseInput(seen.rgb_u8[part], seen.tissue_mask[part], seen.depth[part]) for seen in map(view, true)]
     matrix = MATRIX - [[0, 0, 80], [0, 0, 0], [0, 0, 0]]
-    right = Lens.centered_at_half(matrix, WIDTH - 80, False, 4.0)
+    right = TrackingCamera.centered_at_half(matrix, WIDTH - 80, False, 4.0)
     assert right.px == (WIDTH - 80) / 640 and right.with_focal(2.0).px == right.px
     found, _ = own_path(cropped.__getitem__, 24, right, (WIDTH - 80, HEIGHT))
     off = found.camera_to_world[:, :3, 3] - (np.linalg.inv(true[0]) @ true)[:, :3, 3]

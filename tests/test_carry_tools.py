@@ -137,8 +137,10 @@ def test_one_found_frame_reaches_the_whole_clip_in_both_directions(monkeypatch, 
     segmenter = ColorSegmenter()
     results = list(segment_sequence(sequence, segmenter, tmp_path))
     for i, (mask, tools) in enumerate(results):
-        assert (tools.mask >= box(21, 21, 14, 14)).all() and tools.mask.sum() < 1.4 * 16 * 16, "the tool and its rim"
-        assert (mask == tools.mask | box(0, 0, 2, HEIGHT)).all()
+        assert (tools.tool_mask >= box(21, 21, 14, 14)).all() and tools.tool_mask.sum() < 1.4 * 16 * 16, (
+            "the tool and its rim"
+        )
+        assert (mask == tools.tool_mask | box(0, 0, 2, HEIGHT)).all()
         assert (tools.confidence < 0.5) == (i != 4), "the finder and the segmenter disagree"
     assert [chunk.shown[0][0] for chunk in segmenter.chunks] == [4, 4], "forward and backward, from the surest frame"
 

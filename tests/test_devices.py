@@ -8,7 +8,7 @@ import torch
 from gsplat_stand_in import loaded
 
 from endoprior.cli import devices, main
-from endoprior.cli.devices import Choice, Trial, choose, try_backend, why_no_gpu
+from endoprior.cli.devices import DeviceChoice, Trial, choose, try_backend, why_no_gpu
 from endoprior.core.checks import InputError
 from endoprior.render import trial
 
@@ -131,13 +131,13 @@ def test_torch_for_the_cpu_is_named(monkeypatch):
 )
 def test_the_first_backend_that_works_is_taken(monkeypatch, works, backend, why):
     machine(monkeypatch, **works)
-    assert choose("auto") == choose("cuda") == Choice("cuda", backend, why)
-    assert choose("cpu") == Choice("cpu", "numba", "CPU: as requested")
+    assert choose("auto") == choose("cuda") == DeviceChoice("cuda", backend, why)
+    assert choose("cpu") == DeviceChoice("cpu", "numba", "CPU: as requested")
 
 
 def test_without_a_backend_that_works_the_cpu_is_taken(monkeypatch):
     machine(monkeypatch, triton=None)
-    assert choose("auto") == Choice("cpu", "numba", "CPU: gsplat: not installed; triton: libcuda.so not found")
+    assert choose("auto") == DeviceChoice("cpu", "numba", "CPU: gsplat: not installed; triton: libcuda.so not found")
     with pytest.raises(InputError, match=r"^--device cuda: .*libcuda.so not found.*endoprior doctor"):
         choose("cuda")
 

@@ -15,21 +15,22 @@ from endoprior.runs.folder import CONFIG, LOG, check_state, load_checkpoint, sav
 from endoprior.runs.log import missed_tools_line, missed_tools_of
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.missed_tools import LEAST_SHARE, VISITS, MaskDoubt, missed_tool_frames, record_visit
+from endoprior.training.missed_tools import MIN_MISSED_TOOL_SHARE, VISITS, MaskDoubt, missed_tool_frames, record_visit
 
 MISSED = 4
 
 
 def test_only_the_last_visits_count_and_one_of_them_is_not_enough():
-    shares, much = torch.zeros(3, VISITS), 2 * LEAST_SHARE
+    shares, much = torch.zeros(3, VISITS), 2 * MIN_MISSED_TOOL_SHARE
     for _ in range(VISITS):
         record_visit(shares, 0, much)  # early, then explained
     for share in (0.0, 0.0, 0.0, much):
         record_visit(shares, 0, share)
-    for share in (much, LEAST_SHARE / 2, much, 0.0):
+    for share in (much, MIN_MISSED_TOOL_SHARE / 2, much, 0.0):
         record_visit(shares, 1, share)
     record_visit(shares, 2, much)
-    assert shares.shape == (3, VISITS) and shares[1].tolist() == pytest.approx([much, LEAST_SHARE / 2, much, 0.0])
+    expected = [much, MIN_MISSED_TOOL_SHARE / 2, much, 0.0]
+    assert shares.shape == (3, VISITS) and shares[1].tolist() == pytest.approx(expected)
     assert missed_tool_frames(shares, [0, 2, 5]) == (2,)
 
 

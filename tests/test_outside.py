@@ -6,7 +6,7 @@ import pytest
 from painted_borders import HEIGHT, NOT_ROUND, WIDTH, finish, tissue
 
 from endoprior.data.images import read_color
-from endoprior.footage.border import beyond, find_outline, find_outside
+from endoprior.footage.border import find_outline, find_outside, hidden_by_moving_border
 from endoprior.footage.overlays import find_strokes, without_strokes
 from endoprior.phantom import PhantomConfig, write_phantom
 
@@ -74,7 +74,7 @@ def test_a_border_that_moves_is_masked_in_each_image():
     found = find_outside(images)
     assert found.moves and not find_outside(clip(shape("oval"))).moves
     for image, true in zip(images, seen, strict=True):
-        hidden = found.mask | beyond(image, found.level, ~found.mask)
+        hidden = found.mask | hidden_by_moving_border(image, found.level, ~found.mask)
         assert (~hidden & ~true).sum() < 0.01 * true.size and (hidden & true).sum() < 0.08 * true.sum()
 
 

@@ -65,8 +65,8 @@ def problems(capsys) -> list[str]:
         (DATASETS, "import absent_library", "ModuleNotFoundError: No module named 'absent_library'"),
         (DATASETS, "x = (", "SyntaxError"),
         (DATASETS, "raise SystemExit(3)", "SystemExit: 3"),
-        (DATASETS, "", "expected a Format of endoprior.data.formats, got an object of type module"),
-        (EXPORTERS, "", "expected a Format of endoprior.export.formats, got an object of type module"),
+        (DATASETS, "", "expected a DatasetFormat of endoprior.data.formats, got an object of type module"),
+        (EXPORTERS, "", "expected an ExportFormat of endoprior.export.formats, got an object of type module"),
         (METHODS, "options = {}\ndef train(): pass", "got options of type dict"),
         (METHODS, "from endoprior import Config\noptions = Config()", "got no function train"),
         (SCORES, "", "got SCORES of type NoneType"),
@@ -138,13 +138,13 @@ def test_broken_plugins_break_no_other_command(install, capsys, tiny_sequence, t
     assert len(lines) == 2 and all("absent_library" in line for line in lines)  # dataset and score, once each
     assert main(["check", str(tiny_sequence), "--data.format", "mine"]) == 2
     (line,) = problems(capsys)
-    assert line.startswith("endoprior: plugin mine of other-pkg 1.0 (bad_module): expected a Format")
+    assert line.startswith("endoprior: plugin mine of other-pkg 1.0 (bad_module): expected a DatasetFormat")
 
 
 def test_errors_inside_plugins_cost_their_own_part(install, capsys, tiny_sequence, tmp_path):
     layout = """
-from endoprior.data.formats import Format
-FORMAT = Format(lambda path: 1 / 0, None)
+from endoprior.data.formats import DatasetFormat
+FORMAT = DatasetFormat(lambda path: 1 / 0, None)
 """
     score = GOOD_SCORE.replace('    context.add("extra", 7.0)', '    context.add("extra", {}["key"])')
     install({"datasets": {"mine": "a_layout:FORMAT"}, "scores": {"mine": "a_score"}}, a_layout=layout, a_score=score)

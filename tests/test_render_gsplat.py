@@ -134,8 +134,8 @@ def test_near_plane_itself_is_culled(gsplat):
 def test_a_camera_far_from_the_origin_still_has_a_behind(gsplat):
     view = camera(seed=None)
     view.world_to_camera[:3, 3] = (3e8, -5e8, 9e8)
-    lens = gsplat.lens_of(view, torch.device("cpu"))
-    assert lens.depths(lens.behind) < 0
+    tensors = gsplat.camera_tensors(view, torch.device("cpu"))
+    assert tensors.depths(tensors.behind) < 0
 
 
 def test_several_time_steps_in_one_call_equal_one_call_each(gsplat):
@@ -163,10 +163,10 @@ def test_without_visible_gaussians_the_image_is_the_background(gsplat, num):
 
 def test_cameras_are_kept_by_value(gsplat):
     view, device = camera(), torch.device("cpu")
-    assert gsplat.lens_of(view, device) is gsplat.lens_of(camera(), device)
-    before = gsplat.lens_of(view, device)
+    assert gsplat.camera_tensors(view, device) is gsplat.camera_tensors(camera(), device)
+    before = gsplat.camera_tensors(view, device)
     view.world_to_camera[0, 3] += 1
-    assert not torch.equal(gsplat.lens_of(view, device).viewmats, before.viewmats)
+    assert not torch.equal(gsplat.camera_tensors(view, device).viewmats, before.viewmats)
 
 
 def test_other_types_and_devices_are_rejected(gsplat, monkeypatch):

@@ -193,7 +193,7 @@ def test_tiles_skip_only_what_is_not_rendered():
 @njit
 def _alphas(exponents, out):
     for i in range(0, exponents.size, simd.LANES):
-        alpha, _, _ = blend(simd.load(exponents, i), simd.splat(np.float32(1.0)))
+        alpha, _, _ = blend(simd.load(exponents, i), simd.broadcast(np.float32(1.0)))
         simd.store(out, i, alpha)
 
 

@@ -19,7 +19,7 @@ from endoprior.evaluation.registry import all_scores
 from endoprior.model.presets import preset
 from endoprior_studies.matrix import Matrix
 from endoprior_studies.results import Results
-from endoprior_studies.spec import Cell, Choice
+from endoprior_studies.spec import Cell, SpecSelection
 from endoprior_studies.spec_file import find_spec, load_spec, load_specs, spec_names, specs_of
 from endoprior_studies.tables import FIGURES, published_blocks, published_table, rows_of
 from endoprior_studies.timing import Speed, parts_of, shortened
@@ -58,7 +58,7 @@ def test_table_4_and_5_change_one_thing_at_a_time():
 
 
 def test_figures_stand_below_the_published_ones_of_the_same_method_and_budget():
-    spec = Choice(seeds=(0, 1)).of(load_spec(find_spec("reproduce/table2")))
+    spec = SpecSelection(seeds=(0, 1)).of(load_spec(find_spec("reproduce/table2")))
     cells = {
         Cell(name, "paper", 20_000, seed): {"psnr": 30.0 + 2 * k + seed}
         for k, name in enumerate(("pulling", "cutting"))
@@ -80,7 +80,7 @@ def test_figures_stand_below_the_published_ones_of_the_same_method_and_budget():
 
 def test_methods_that_take_weeks_run_only_if_they_are_named():
     paths = specs_of(find_spec("reproduce"))
-    usual, named = load_specs(paths, {}), load_specs(paths, {}, Choice(("endonerf",), (4,), 30))
+    usual, named = load_specs(paths, {}), load_specs(paths, {}, SpecSelection(("endonerf",), (4,), 30))
     assert all("endonerf" not in spec.methods for spec in usual.values())
     assert {path.stem for path in named} == {"table1", "table1_scared"}
     for spec in named.values():
@@ -88,7 +88,7 @@ def test_methods_that_take_weeks_run_only_if_they_are_named():
         (name, *_) = spec.sequences
         assert spec.config("endonerf", name, None, 4).schedule.total == 30
     with pytest.raises(InputError, match=r"--methods: expected one of .*, got 'nerf'"):
-        load_specs(paths, {}, Choice(("nerf",)))
+        load_specs(paths, {}, SpecSelection(("nerf",)))
 
 
 def test_an_estimate_counts_each_part_of_a_schedule(tmp_path):

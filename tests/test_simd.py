@@ -15,8 +15,8 @@ def _run(a, b, c, out):
     x, y, z = simd.load(a, 3), simd.load(b, 0), simd.load(c, 0)
     results = (
         x + y, x - y, x * y, x / y, -x, simd.fma(x, y, z), simd.magnitude(x), simd.floor(x), simd.smaller(x, y),
-        simd.larger(x, y), simd.where_ge(x, y, z, simd.splat(f4(7.0))), simd.scale_by_power_of_two(y, simd.floor(x)),
-        simd.lane_numbers(), simd.splat(f4(2.5)),
+        simd.larger(x, y), simd.where_ge(x, y, z, simd.broadcast(f4(7.0))),
+        simd.scale_by_power_of_two(y, simd.floor(x)), simd.lane_numbers(), simd.broadcast(f4(2.5)),
     )  # fmt: skip
     for i in range(len(results)):
         simd.store(out, i * simd.LANES, results[i])
@@ -46,12 +46,12 @@ def _copy_some(source, target, loaded, lanes):
     for k in range(len(loaded)):
         some = simd.load_some(source, 3, lanes if k else simd.LANES)  # the second load must not see the first
         simd.store(loaded[k], 0, some)
-    simd.store_some(target, 2, some + simd.splat(f4(1.0)), lanes)
+    simd.store_some(target, 2, some + simd.broadcast(f4(1.0)), lanes)
 
 
 @njit
 def _copy_all(source, target):
-    simd.store_some(target, 2, simd.load_some(source, 3, None) + simd.splat(f4(1.0)), None)
+    simd.store_some(target, 2, simd.load_some(source, 3, None) + simd.broadcast(f4(1.0)), None)
 
 
 def test_a_part_of_a_vector_touches_nothing_else():

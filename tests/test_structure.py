@@ -26,7 +26,7 @@ FLOORS = [
     {"pipeline"},
     {"cli"},
 ]
-"""Packages, lowest first. A package imports from floors below its own, never from its own or from above."""
+"""Packages, lowest first. A package imports from layers below its own, never from its own or from above."""
 FLOOR_OF = {name: level for level, names in enumerate(FLOORS) for name in names}
 ROOT_FILES = {"__init__.py", "__main__.py", "py.typed"}
 CHECKED_PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})

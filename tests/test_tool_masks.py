@@ -56,22 +56,22 @@ def overlap(found, true):
 def test_tools_of_the_phantom_are_found(phantom):
     images, true, _ = phantom
     found = [ToolFinder().find(image, whole(image)) for image in images]
-    assert overlap([tools.mask for tools in found], true) > 0.8
+    assert overlap([tools.tool_mask for tools in found], true) > 0.8
     assert all(0.5 < tools.confidence <= 1 for tools in found)
 
 
 def test_tissue_alone_gives_empty_masks(phantom):
-    assert not any(ToolFinder().find(image, whole(image)).mask.any() for image in phantom[2])
+    assert not any(ToolFinder().find(image, whole(image)).tool_mask.any() for image in phantom[2])
 
 
 def test_exposure_color_and_mirroring_hardly_matter(phantom):
     image, finder = phantom[0][1], ToolFinder()
-    usual = finder.find(image, whole(image)).mask
+    usual = finder.find(image, whole(image)).tool_mask
     dark = (image * 0.6).astype(np.uint8)
     pale = (0.6 * image + 0.4 * image.mean(-1, keepdims=True)).astype(np.uint8)
     for changed in (dark, pale):
-        assert overlap([finder.find(changed, whole(image)).mask], [usual]) > 0.8
-    mirrored = finder.find(np.ascontiguousarray(image[:, ::-1]), whole(image)).mask[:, ::-1]
+        assert overlap([finder.find(changed, whole(image)).tool_mask], [usual]) > 0.8
+    mirrored = finder.find(np.ascontiguousarray(image[:, ::-1]), whole(image)).tool_mask[:, ::-1]
     assert overlap([mirrored], [usual]) > 0.95
 
 
@@ -80,20 +80,20 @@ def test_masks_stay_inside_the_view_and_repeat(phantom):
     y, x = np.mgrid[: SIZE[1], : SIZE[0]]
     view = np.hypot(x - SIZE[0] / 2, y - SIZE[1] / 2) < 110
     first, second = (ToolFinder().find(image * view[..., None], view) for _ in range(2))
-    assert (first.mask == second.mask).all() and first.confidence == second.confidence
-    assert not (first.mask & ~view).any()
+    assert (first.tool_mask == second.tool_mask).all() and first.confidence == second.confidence
+    assert not (first.tool_mask & ~view).any()
 
 
 def test_empty_views_give_empty_masks():
     image = np.full((40, 60, 3), 90, np.uint8)
     found = ToolFinder().find(image, np.zeros((40, 60), bool))
-    assert not found.mask.any() and found.confidence == 1 and not found.uncertain
+    assert not found.tool_mask.any() and found.confidence == 1 and not found.uncertain
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (700, 40)])
 def test_any_size_is_taken(shape):
     rgb_u8 = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
-    assert ToolFinder().find(rgb_u8, np.ones(shape, bool)).mask.shape == shape
+    assert ToolFinder().find(rgb_u8, np.ones(shape, bool)).tool_mask.shape == shape
     assert max(network_size(shape)) == LONG_SIDE_PX
 
 
@@ -163,7 +163,7 @@ def test_real_clip(real_clip):
     files = [f"{i:06d}.png" for i in range(0, 90, 10)]
     images = [read_color(real_clip / "images" / name) for name in files]
     true = [read_tool_mask(real_clip / "masks" / name) for name in files]
-    found = [ToolFinder().find(image, whole(image)).mask for image in images]
+    found = [ToolFinder().find(image, whole(image)).tool_mask for image in images]
     for masks in (found, true):
         for mask in masks:
             mask[:42, :110] = False  # the burned-in label is no tool

@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 
 from endoprior.prepare.camera_path import tube
-from endoprior.prepare.camera_path.shape import MOST_RATIO, axial_cosine
-from endoprior.prepare.camera_path.tracks import Lens, PoseInput
+from endoprior.prepare.camera_path.path_facts import MOST_RATIO
+from endoprior.prepare.camera_path.shape import axial_cosine
+from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
 from endoprior.prepare.camera_path.tube import shape_by_light
 from endoprior.prepare.relative_depth import fit_shading
 
 SIZE = WIDTH, HEIGHT = 160, 128
-LENS = Lens(np.array([[140.0, 0, 79.5], [0, 140.0, 63.5], [0, 0, 1]]), WIDTH, True)
+LENS = TrackingCamera(np.array([[140.0, 0, 79.5], [0, 140.0, 63.5], [0, 0, 1]]), WIDTH, True)
 COSINE = axial_cosine(LENS, SIZE)
 EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
 Y, X = np.mgrid[:HEIGHT, :WIDTH]

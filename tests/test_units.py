@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from endoprior.footage.units import guess_unit
+from endoprior.footage.depth_unit import guess_unit
 
 HEIGHT, WIDTH = 60, 80
 

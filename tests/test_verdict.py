@@ -10,7 +10,7 @@ from endoprior.cli.run import last_words
 from endoprior.core.types import Camera, Frame
 from endoprior.evaluation.scorers.image import psnr_tissue
 from endoprior.evaluation.scorers.references import follow, mean_image, moved_frame, relief_agreement, triangulated
-from endoprior.evaluation.verdict import Facts, Verdict, verdict_on
+from endoprior.evaluation.verdict import Verdict, VerdictFacts, verdict_on
 
 WIDTH, HEIGHT = 160, 128
 MATRIX = np.array([[150.0, 0, 80], [0, 150.0, 64], [0, 0, 1]])
@@ -113,31 +113,56 @@ def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
 @pytest.mark.parametrize(
     ("changes", "facts", "word", "reason"),
     [
-        ({}, Facts(), "good", "1.0 dB below the nearest frame"),
-        ({"psnr_tissue": 29.0, "gain_over_flow": -5.0}, Facts(), "usable", "5.0 dB below"),
-        ({"psnr_tissue": 33.5, "gain_over_flow": -9.0}, Facts(), "good", "9.0 dB below"),
-        ({"psnr_tissue": 27.0, "gain_over_flow": -9.0}, Facts(), "doubtful", "9.0 dB below"),
-        ({"psnr_tissue": 25.0, "gain_over_mean": 0.9}, Facts(), "wrong", "the mean of all frames alone has 24.1 dB"),
-        ({"psnr_tissue": 14.0, "gain_over_mean": -19.6}, Facts(), "wrong", "the mean of all frames alone has 33.6 dB"),
-        ({"psnr_tissue": 25.0, "gain_over_mean": 2.5, "gain_over_flow": 0.5}, Facts(), "doubtful", "does not follow"),
+        ({}, VerdictFacts(), "good", "1.0 dB below the nearest frame"),
+        ({"psnr_tissue": 29.0, "gain_over_flow": -5.0}, VerdictFacts(), "usable", "5.0 dB below"),
+        ({"psnr_tissue": 33.5, "gain_over_flow": -9.0}, VerdictFacts(), "good", "9.0 dB below"),
+        ({"psnr_tissue": 27.0, "gain_over_flow": -9.0}, VerdictFacts(), "doubtful", "9.0 dB below"),
+        (
+            {"psnr_tissue": 25.0, "gain_over_mean": 0.9},
+            VerdictFacts(),
+            "wrong",
+            "the mean of all frames alone has 24.1 dB",
+        ),
+        (
+            {"psnr_tissue": 14.0, "gain_over_mean": -19.6},
+            VerdictFacts(),
+            "wrong",
+            "the mean of all frames alone has 33.6 dB",
+        ),
+        (
+            {"psnr_tissue": 25.0, "gain_over_mean": 2.5, "gain_over_flow": 0.5},
+            VerdictFacts(),
+            "doubtful",
+            "does not follow",
+        ),
         # Nothing moves: the mean image is as good as anything, and being a little below it is not wrong.
-        ({"psnr_tissue": 34.0, "gain_over_flow": -1.5, "gain_over_mean": -0.5}, Facts(), "good", "1.5 dB below"),
-        ({"slip_px": 6.0}, Facts(), "usable", "slips by 6.0 px"),
-        ({"slip_px": 22.0}, Facts(), "doubtful", "slips by 22.0 px"),
-        ({"depth_triangulated_error": 0.05}, Facts(depth_is_guessed=True), "good", "5% off"),
-        ({"depth_triangulated_error": 0.5}, Facts(), "doubtful", "50% off"),
-        ({}, Facts(depth_is_guessed=True), "usable", "a guess from one eye"),
-        ({"depth_triangulated_error": 0.05}, Facts(depth_measured=0.27), "usable", "parallax on 27% of the tissue"),
-        ({"depth_triangulated_error": 0.05}, Facts(depth_measured=0.7), "good", "5% off"),
-        ({}, Facts(share_used=0.7), "usable", "70% of the frames"),
-        ({}, Facts(share_used=0.3), "doubtful", "30% of the frames"),
-        ({}, Facts(share_with_missed_tools=0.08), "usable", "missed in 8%"),
-        ({}, Facts(share_with_missed_tools=0.17), "doubtful", "missed in 17%"),
-        ({}, Facts(motion_is_unknown=True), "doubtful", "path is unknown"),
-        ({}, Facts(findings=("camera-moves",)), "doubtful", "say that it is static"),
-        ({}, Facts(findings=("depth-disparity",)), "doubtful", "near is far"),
-        ({"depth_triangulated_error": 0.1, "depth_relief": -0.05}, Facts(), "doubtful", "does not rise and fall"),
-        ({"depth_triangulated_error": 0.1, "depth_relief": 0.2}, Facts(), "good", "10% off"),
+        ({"psnr_tissue": 34.0, "gain_over_flow": -1.5, "gain_over_mean": -0.5}, VerdictFacts(), "good", "1.5 dB below"),
+        ({"slip_px": 6.0}, VerdictFacts(), "usable", "slips by 6.0 px"),
+        ({"slip_px": 22.0}, VerdictFacts(), "doubtful", "slips by 22.0 px"),
+        ({"depth_triangulated_error": 0.05}, VerdictFacts(depth_is_guessed=True), "good", "5% off"),
+        ({"depth_triangulated_error": 0.5}, VerdictFacts(), "doubtful", "50% off"),
+        ({}, VerdictFacts(depth_is_guessed=True), "usable", "a guess from one eye"),
+        (
+            {"depth_triangulated_error": 0.05},
+            VerdictFacts(depth_measured=0.27),
+            "usable",
+            "parallax on 27% of the tissue",
+        ),
+        ({"depth_triangulated_error": 0.05}, VerdictFacts(depth_measured=0.7), "good", "5% off"),
+        ({}, VerdictFacts(share_used=0.7), "usable", "70% of the frames"),
+        ({}, VerdictFacts(share_used=0.3), "doubtful", "30% of the frames"),
+        ({}, VerdictFacts(share_with_missed_tools=0.08), "usable", "missed in 8%"),
+        ({}, VerdictFacts(share_with_missed_tools=0.17), "doubtful", "missed in 17%"),
+        ({}, VerdictFacts(motion_is_unknown=True), "doubtful", "path is unknown"),
+        ({}, VerdictFacts(findings=("camera-moves",)), "doubtful", "say that it is static"),
+        ({}, VerdictFacts(findings=("depth-disparity",)), "doubtful", "near is far"),
+        (
+            {"depth_triangulated_error": 0.1, "depth_relief": -0.05},
+            VerdictFacts(),
+            "doubtful",
+            "does not rise and fall",
+        ),
+        ({"depth_triangulated_error": 0.1, "depth_relief": 0.2}, VerdictFacts(), "good", "10% off"),
     ],
 )
 def test_the_worst_evidence_decides(changes, facts, word, reason):
@@ -155,7 +180,7 @@ def test_flat_and_inverted_depth_have_no_relief():
 
 
 def test_what_nothing_confirms_is_not_good():
-    verdict = verdict_on({name: value for name, value in GOOD_SCORES.items() if name != "slip_px"}, Facts())
+    verdict = verdict_on({name: value for name, value in GOOD_SCORES.items() if name != "slip_px"}, VerdictFacts())
     assert verdict.word == "usable" and "too few points" in verdict.reasons[0]
 
 
@@ -165,14 +190,14 @@ SLIDES = ", but its tissue may not move as the real one does"
 @pytest.mark.parametrize(
     ("changes", "facts", "plain"),
     [
-        ({}, Facts(), "Good to look at; it can be measured"),
-        ({}, Facts(lengths_are_relative=True), "Good to look at; do not measure: lengths are not millimeters"),
-        ({}, Facts(motion_is_unknown=True), f"Good to look at{SLIDES}; do not measure"),
-        ({"slip_px": 12.6}, Facts(), f"Good to look at{SLIDES}; do not measure"),
-        ({"slip_px": 6.0}, Facts(), "Good to look at; measure with care"),
-        ({}, Facts(share_used=0.7), "Good enough to look at; measure with care"),
-        ({}, Facts(share_with_missed_tools=0.17), "Look at it only beside the video; do not measure"),
-        ({"psnr_tissue": 20.0, "gain_over_mean": 0.5}, Facts(lengths_are_relative=True), "Wrong: do not use it"),
+        ({}, VerdictFacts(), "Good to look at; it can be measured"),
+        ({}, VerdictFacts(lengths_are_relative=True), "Good to look at; do not measure: lengths are not millimeters"),
+        ({}, VerdictFacts(motion_is_unknown=True), f"Good to look at{SLIDES}; do not measure"),
+        ({"slip_px": 12.6}, VerdictFacts(), f"Good to look at{SLIDES}; do not measure"),
+        ({"slip_px": 6.0}, VerdictFacts(), "Good to look at; measure with care"),
+        ({}, VerdictFacts(share_used=0.7), "Good enough to look at; measure with care"),
+        ({}, VerdictFacts(share_with_missed_tools=0.17), "Look at it only beside the video; do not measure"),
+        ({"psnr_tissue": 20.0, "gain_over_mean": 0.5}, VerdictFacts(lengths_are_relative=True), "Wrong: do not use it"),
     ],
 )
 def test_plain_words_say_what_a_model_is_good_for(changes, facts, plain):
@@ -180,7 +205,7 @@ def test_plain_words_say_what_a_model_is_good_for(changes, facts, plain):
 
 
 def test_without_a_held_out_frame_nothing_is_good():
-    assert verdict_on({}, Facts()).word == "doubtful"
+    assert verdict_on({}, VerdictFacts()).word == "doubtful"
 
 
 def test_what_is_wrong_is_not_called_done(tmp_path):

@@ -28,12 +28,12 @@ from typing_extensions import override
 from endoprior.compute.parallel_kernels import parallel_njit
 from endoprior.compute.simd import (
     LANES,
+    broadcast,
     fma,
     largest,
     load_some,
     magnitude,
     power_of_two,
-    splat,
     square_root,
     store,
     store_some,
@@ -122,26 +122,26 @@ class _Compiled(torch.autograd.Function):
 @njit(forceinline=True)
 def _reach(away, square):
     # Whether some lane is above 0: its ratio (t - c)^2 / square is below _REACH.
-    return largest(fma(splat(_REACH), square, -(away * away))) > _ZERO
+    return largest(fma(broadcast(_REACH), square, -(away * away))) > _ZERO
 
 
 @njit(forceinline=True)
 def _bell(ratio):
     # exp(-ratio^2), 0 from _REACH on.
-    exponent = splat(-_LOG2_E) * ratio * ratio
-    return where_ge(ratio, splat(_REACH), splat(_ZERO), power_of_two(exponent))
+    exponent = broadcast(-_LOG2_E) * ratio * ratio
+    return where_ge(ratio, broadcast(_REACH), broadcast(_ZERO), power_of_two(exponent))
 
 
 @njit(forceinline=True)
 def _value(weights, centers, widths, time, place, lanes, held, slot):
     # Writes w exp(-ratio^2) of the coefficients from `place` on to `held` from `slot` on.
-    away = splat(time) - load_some(centers, place, lanes)
+    away = broadcast(time) - load_some(centers, place, lanes)
     width = load_some(widths, place, lanes)
-    square = fma(width, width, splat(_SMALLEST_SQUARE))
+    square = fma(width, width, broadcast(_SMALLEST_SQUARE))
     if _reach(away, square):
         store(held, slot, load_some(weights, place, lanes) * _bell(away * away / square))
     else:
-        store(held, slot, splat(_ZERO))
+        store(held, slot, broadcast(_ZERO))
 
 
 @parallel_njit()
@@ -171,18 +171,20 @@ def _value_at(weights, centers, widths, bases, time, out):
 @njit(forceinline=True)
 def _unless_below(least, value):
     # 0 where the magnitude is below `least`.
-    return where_ge(magnitude(value), splat(least), value, splat(_ZERO))
+    return where_ge(magnitude(value), broadcast(least), value, broadcast(_ZERO))
 
 
 @njit(forceinline=True)
 def _adam(param, first, second, place, lanes, value, grad, rate, root_scale, beta1, beta2, epsilon):
     # One step of `LANES` elements whose value and gradient are known.
     grad = _unless_below(_FELT * epsilon, grad)
-    m = _unless_below(_MOVES * epsilon, fma(splat(beta1), load_some(first, place, lanes), splat(_ONE - beta1) * grad))
-    v = fma(splat(beta2), load_some(second, place, lanes), splat(_ONE - beta2) * grad * grad)
+    m = _unless_below(
+        _MOVES * epsilon, fma(broadcast(beta1), load_some(first, place, lanes), broadcast(_ONE - beta1) * grad)
+    )
+    v = fma(broadcast(beta2), load_some(second, place, lanes), broadcast(_ONE - beta2) * grad * grad)
     store_some(first, place, m, lanes)
     store_some(second, place, v, lanes)
-    change = splat(rate) * m / fma(square_root(v), splat(root_scale), splat(epsilon))
+    change = broadcast(rate) * m / fma(square_root(v), broadcast(root_scale), broadcast(epsilon))
     store_some(param, place, value - change, lanes)
 
 
@@ -192,14 +194,14 @@ def _step(
 ):  # fmt: skip
     # One step of the `LANES` coefficients from `place` on; `held` (K, ...) has the gradient of the value of each.
     weight, center, width = load_some(w, place, lanes), load_some(c, place, lanes), load_some(s, place, lanes)
-    square = fma(width, width, splat(_SMALLEST_SQUARE))
-    v_weight = v_center = v_width = splat(_ZERO)
+    square = fma(width, width, broadcast(_SMALLEST_SQUARE))
+    v_weight = v_center = v_width = broadcast(_ZERO)
     for k in range(len(times)):
-        away = splat(times[k]) - center
+        away = broadcast(times[k]) - center
         if _reach(away, square):
             ratio = away * away / square
             v_found = load_some(held[k], slot, None) * _bell(ratio)
-            slope = splat(f4(4)) * ratio * weight * v_found / square
+            slope = broadcast(f4(4)) * ratio * weight * v_found / square
             v_weight = v_weight + v_found
             v_center = fma(slope, away, v_center)
             v_width = fma(slope, ratio * width, v_width)

@@ -149,10 +149,10 @@ def _checked(args: Bench) -> dict[str, Path]:
 def _chosen(args: Bench, source: Path, folders: dict[str, Path]) -> dict[Path, Spec]:
     """The specs to run. Folders that were typed must be there; of published tables those run that they belong to."""
     from .matrix import open_sequence
-    from .spec import Choice
+    from .spec import SpecSelection
     from .spec_file import load_specs, specs_of
 
-    loaded = load_specs(specs_of(source), folders, Choice(args.methods, args.seeds, args.iterations))
+    loaded = load_specs(specs_of(source), folders, SpecSelection(args.methods, args.seeds, args.iterations))
     typed = {path: folders.keys() & spec.sequences.keys() for path, spec in loaded.items()}
     for path, names in typed.items():
         for name in sorted(names):

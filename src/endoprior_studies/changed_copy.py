@@ -103,7 +103,7 @@ def _put_found_masks(sequence: FrameSequence, copy: Path) -> None:
         place = copy / file.relative_to(sequence.path).as_posix()
         place.parent.mkdir(exist_ok=True)
         write_mask(place, mask, sequence.mask_tool_value)
-        with_tools += bool(tools.mask.any())
+        with_tools += bool(tools.tool_mask.any())
     note_found_masks(copy, with_tools / len(sequence))
 
 

@@ -16,7 +16,7 @@ from endoprior.system.console import say
 from endoprior.system.ray_cluster import connected
 from endoprior.system.surroundings import python_command
 
-from .worker import Job
+from .worker import CellJob
 
 SHOWN_LOG_LINES = 3
 
@@ -25,17 +25,17 @@ SHOWN_LOG_LINES = 3
 class Outcome:
     """How a job ended."""
 
-    job: Job
+    job: CellJob
     seconds: float
     failure: str = ""
     """Why it failed, from the end of its log; empty if it succeeded."""
 
 
-Executor = Callable[[list[Job]], Iterator[Outcome]]
+Executor = Callable[[list[CellJob]], Iterator[Outcome]]
 """Where jobs run; yields the outcome of each as it ends."""
 
 
-def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
+def run_job(job: CellJob, started: list[subprocess.Popen] | None = None) -> Outcome:
     """Run one job in its own process and wait for it; its output goes to `.log.txt` beside its cell's folder.
 
     Args:
@@ -69,7 +69,7 @@ def local_executor(num_jobs: int) -> Iterator[Executor]:
     """Processes of this machine, `num_jobs` at a time. Ctrl-C interrupts all of them, and each saves its state."""
     started: list[subprocess.Popen] = []
 
-    def execute(jobs: list[Job]) -> Iterator[Outcome]:
+    def execute(jobs: list[CellJob]) -> Iterator[Outcome]:
         waiting = list(reversed(jobs))
         with ThreadPoolExecutor(num_jobs) as pool:
             running = set()
@@ -98,7 +98,7 @@ def ray_executor(address: str, threads: int) -> Iterator[Executor]:
     """
     with connected(address, say) as cluster:
 
-        def execute(jobs: list[Job]) -> Iterator[Outcome]:
+        def execute(jobs: list[CellJob]) -> Iterator[Outcome]:
             for job in jobs:
                 cluster.start(job, run_job, job, cores=threads)
             while cluster.num_running:

@@ -30,7 +30,7 @@ from .execute import Executor
 from .matched_count import Place, Search, search_thresholds
 from .method import origin_of
 from .spec import Cell, Spec, cells, sequence_folder
-from .worker import REPEAT, Job, finished
+from .worker import REPEAT, CellJob, finished
 
 if TYPE_CHECKING:
     from endoprior.data import FrameSequence
@@ -155,7 +155,7 @@ class _Runner:
     def report(self, some: list[Cell]) -> None:
         """Say how many of some cells there are to run."""
         unread = sum(cell.sequence in self.unreadable for cell in some)
-        jobs = {cell: job for cell in some if isinstance(job := self._job(cell, None), Job)}
+        jobs = {cell: job for cell in some if isinstance(job := self._job(cell, None), CellJob)}
         searched = len(cells(self.matrix.spec)) - len(some)
         later = f", {searched} after a search for their threshold" if searched else ""
         done = len(some) - unread - len(jobs)
@@ -190,7 +190,7 @@ class _Runner:
             result = f"failed: {outcome.failure}" if outcome.failure else f"done in {outcome.seconds:.0f} s"
             self.progress(f"[{ended}/{len(by_folder)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
 
-    def _job(self, cell: Cell, threshold: float | None) -> Job | Path | str:
+    def _job(self, cell: Cell, threshold: float | None) -> CellJob | Path | str:
         """The job of a cell; its folder if it is finished, and the reason if it cannot run."""
         matrix, spec = self.matrix, self.matrix.spec
         if reason := self.unreadable.get(cell.sequence):
@@ -210,7 +210,7 @@ class _Runner:
         folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
         if finished(folder, key):
             return folder
-        return Job(
+        return CellJob(
             name=cell.name,
             folder=str(folder),
             data=str(self.trained_on[cell.sequence].absolute()),

@@ -244,7 +244,7 @@ class Spec:
 
 
 @dataclass(frozen=True)
-class Choice:
+class SpecSelection:
     """Which part of a spec to run."""
 
     methods: tuple[str, ...] = ()

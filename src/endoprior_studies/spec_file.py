@@ -22,7 +22,7 @@ from endoprior.evaluation.registry import all_scores
 from endoprior.model.presets import preset_names
 
 from .method import PICTURES, method_names
-from .spec import Choice, MatchSpec, MethodSpec, SequenceSpec, Spec, cells
+from .spec import MatchSpec, MethodSpec, SequenceSpec, Spec, SpecSelection, cells
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
@@ -78,13 +78,13 @@ def _specs(folder: Path, pattern: str) -> list[Path]:
     return sorted(path for path in folder.glob(pattern) if path.suffix in READERS and path.name[0] != "_")
 
 
-def load_spec(path: Path, data: dict[str, Path] | None = None, choice: Choice | None = None) -> Spec:
+def load_spec(path: Path, data: dict[str, Path] | None = None, selection: SpecSelection | None = None) -> Spec:
     """Read and check a spec.
 
     Args:
         path: `.yaml`, `.yml` or `.toml`.
         data: folders of sequences by name; they override those of the file.
-        choice: the part of it to run; None is everything.
+        selection: the part of it to run; None is everything.
     Raises:
         InputError: naming the file, the field, what is expected and what is there.
     """
@@ -101,29 +101,29 @@ def load_spec(path: Path, data: dict[str, Path] | None = None, choice: Choice | 
                 raise InputError(f"--data {name}: expected one of {', '.join(spec.sequences)}. Fix: Correct the name.")
             known = replace(spec.sequences[name], path=str(folder.absolute()), phantom=None)
             spec = replace(spec, sequences=spec.sequences | {name: known})
-        spec = choice.of(spec) if choice else spec
+        spec = selection.of(spec) if selection else spec
         _check(spec)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return spec
 
 
-def load_specs(paths: list[Path], data: dict[str, Path], choice: Choice | None = None) -> dict[Path, Spec]:
-    """Read and check specs, each with the folders in `data` of its own sequences; without those that `choice` empties.
+def load_specs(paths: list[Path], data: dict[str, Path], selection: SpecSelection | None = None) -> dict[Path, Spec]:
+    """Read and check specs, each with the folders in `data` of its own sequences; without those it leaves empty.
 
     Raises:
-        InputError: as `load_spec`; also for a name in `data` or `choice` that is in none of them.
+        InputError: as `load_spec`; also for a name in `data` or `selection` that is in none of them.
     """
-    specs, choice = {path: load_spec(path) for path in paths}, choice or Choice()
+    specs, selection = {path: load_spec(path) for path in paths}, selection or SpecSelection()
     known = {name for spec in specs.values() for name in spec.sequences}
     methods = sorted({name for spec in specs.values() for name in spec.methods})
-    for name in choice.methods:
+    for name in selection.methods:
         _demand_one_of("--methods", name, methods)
     chosen = {}
     for path, spec in specs.items():
         own = {name: data[name] for name in data if name in spec.sequences or name not in known}
-        if not choice.methods or {*choice.methods} & {*spec.methods}:
-            chosen[path] = load_spec(path, own, choice)
+        if not selection.methods or {*selection.methods} & {*spec.methods}:
+            chosen[path] = load_spec(path, own, selection)
     return chosen
 
 

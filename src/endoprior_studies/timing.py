@@ -163,12 +163,12 @@ def estimate(specs: dict[str, Spec], out: Path, run: Run) -> Estimate:
 
 def _measured(spec: Spec, cell: Cell, run: Run) -> Speed | None:
     """The speed of a cell; None if it is not worth it, cannot be measured or fails."""
-    options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
-    if not isinstance(options, Config):
+    cfg = spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
+    if not isinstance(cfg, Config):
         return None
-    changes = shortened(options)
-    short = options.replace(changes)
-    if options.schedule.total < WORTH_IT * short.schedule.total:
+    changes = shortened(cfg)
+    short = cfg.replace(changes)
+    if cfg.schedule.total < WORTH_IT * short.schedule.total:
         return None
     method = replace(spec.methods[cell.method], set=spec.methods[cell.method].set | changes, match=None)
     alone = {"sequences": {cell.sequence: spec.sequences[cell.sequence]}, "methods": {cell.method: method}}

@@ -1,6 +1,6 @@
 """Train and score one cell of a benchmark in its own process; `cell.json` marks it as finished.
 
-`python -m endoprior_studies.worker JOB.json`, where JOB.json holds the fields of `Job`. An interrupted cell
+`python -m endoprior_studies.worker JOB.json`, where JOB.json holds the fields of `CellJob`. An interrupted cell
 resumes from its checkpoint.
 """
 
@@ -31,7 +31,7 @@ ESTIMATED = "methods train with a camera path estimated from the footage; path s
 
 
 @dataclass(frozen=True)
-class Job:
+class CellJob:
     """The input of a worker."""
 
     name: str
@@ -75,7 +75,7 @@ def finished(folder: Path, key: str) -> bool:
         return False
 
 
-def work(job: Job) -> None:
+def work(job: CellJob) -> None:
     """Train and score one cell; its run folder is `run/`, the scores are beside it.
 
     Raises:
@@ -140,7 +140,7 @@ def main(argv: list[str]) -> int:
     """Work on the job file `argv[0]`; exit status as for the command line."""
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     try:
-        work(read_own(Path(argv[0]), Job, REPEAT))
+        work(read_own(Path(argv[0]), CellJob, REPEAT))
     except InputError as error:
         complain(f"endoprior: {' '.join(str(error).split())}")
         return 2

@@ -9,7 +9,7 @@ from endoprior.core.types import Camera
 from endoprior.data import FrameSequence, read_depth_file
 from endoprior.data.assemble import Pixels, assemble, kept_frames
 from endoprior.data.files import list_files
-from endoprior.data.formats import Format
+from endoprior.data.formats import DatasetFormat
 from endoprior.data.frame_files import files_of_images
 from endoprior.data.images import read_color
 from endoprior.data.poses import identity_poses
@@ -43,4 +43,4 @@ def load_rendered(path: Path, cfg: DataConfig) -> FrameSequence:
     return assemble(path, cfg, cameras, decode, images=images, files=depths, remarks=remarks, mask_folder="rgb")
 
 
-FORMAT = Format(is_rendered, load_rendered)
+FORMAT = DatasetFormat(is_rendered, load_rendered)

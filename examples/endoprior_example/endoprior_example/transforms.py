@@ -7,7 +7,7 @@ import numpy as np
 
 from endoprior import Scene
 from endoprior.export import ExportOptions
-from endoprior.export.formats import Format, Progress
+from endoprior.export.formats import ExportFormat, Progress
 from endoprior.system.atomic import whole_file
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -27,4 +27,4 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         temporary.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1))
 
 
-FORMAT = Format(suffixes=(".json",), options=(), write=write)
+FORMAT = ExportFormat(suffixes=(".json",), options=(), write=write)

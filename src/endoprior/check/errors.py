@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from ..core.config import DataConfig
 from ..data import FrameSequence
 from ..footage.changes import find_cuts
+from ..footage.depth_unit import UnitGuess
+from ..footage.mask_polarity import Polarity
 from ..footage.pose_fit import PoseFit
 from ..footage.stereo_order import StereoOrder
-from ..footage.units import Polarity, UnitGuess
 from ..system.parallel import frame_threads
 from .finding import About, Finding, convert_poses, frame_list, longest_part, set_values
 from .samples import (

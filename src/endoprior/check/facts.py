@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from ..core.config import DataConfig
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.contents import overexposed
@@ -25,13 +25,14 @@ from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
+from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.known_facts import KnownFacts
+from ..footage.mask_polarity import Polarity
 from ..footage.masked_tissue import MaskedTissue, find_masked_tissue
 from ..footage.overlays import without_strokes
 from ..footage.pose_fit import PoseFit
 from ..footage.text_network import TextDetector
 from ..footage.texts import resting_rectangles
-from ..footage.units import FAR_MM, Polarity, UnitGuess
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
 from ..system.parallel import Pool, frame_threads
@@ -254,7 +255,7 @@ def _camera_path(cameras: list[Camera]) -> tuple[float, float]:
 
 def _first_points(sequence: FrameSequence) -> PointCloud | None:
     train = sequence.frames("train")
-    frames = [train[int(i)] for i in spread(len(train), POINT_FRAMES)]
+    frames = [train[int(i)] for i in evenly_spaced(len(train), POINT_FRAMES)]
     if not any((frame.tissue_mask & frame.depth_valid).any() for frame in frames):
         return None
     try:

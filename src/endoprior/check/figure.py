@@ -17,11 +17,11 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit, project
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Frame
 from ..data import FrameSequence
+from ..footage.depth_unit import FAR_MM, NEAR_MM
 from ..footage.overlays import find_strokes
-from ..footage.units import FAR_MM, NEAR_MM
 from ..visualization.figures import save_figure
 from ..visualization.image_tools import colorize
 from .facts import Facts
@@ -58,7 +58,7 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     figure.suptitle(title, fontsize=13, parse_math=False)
     heights = [5.6, 3.4, 4.8, *([UNSURE_HEIGHT] if unsure or like else [])]
     images, curves, space, *rest = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
-    _draw_frames(images, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
+    _draw_frames(images, [sequence.frame(i) for i in evenly_spaced(len(sequence), SHOWN)], facts)
     left, right = curves.subfigures(1, 2, squeeze=False, width_ratios=[1, 2.4]).flat
     _draw_histogram(left.subplots(), facts)
     _draw_curves(right, facts, findings)

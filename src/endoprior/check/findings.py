@@ -16,7 +16,8 @@ from ..core.shell import command
 from ..data.description import MOTION, SIZE_NOT_STATED
 from ..data.image_folders import ways_to_prepare
 from ..footage.camera_motion import MOVING_FRACTION
-from ..footage.units import FAR_MM
+from ..footage.depth_unit import FAR_MM
+from ..footage.disturbances import DARK_MEAN_GRAY
 from ..model.presets import preset
 from .errors import scene_cuts, swapped_eyes, swapped_masks, wrong_poses, wrong_unit
 from .facts import Facts
@@ -34,7 +35,6 @@ USUAL_FOCAL = 0.9  # Focal length of a usual endoscope, image widths: 58 degrees
 ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
 """Seconds of a training iteration with `default` on two cores, start included, at this size of the image, and the share
 that does not depend on it (docs/results.md)."""
-DARK = 0.05  # Images with a smaller mean, of 1, are nearly black
 EXPORT = "export them again, with all values from 0 to 255 in use"
 WHITE = 0.99  # A larger share of the tissue that is overexposed leaves nothing to train on
 FAR_SHARE = 1e-3
@@ -245,7 +245,7 @@ def _changes(facts: Facts) -> Iterator[Finding]:
 def _video(facts: Facts) -> Iterator[Finding]:
     """What `prepare` found particular about the video, and images that are nearly black, or white in part."""
     brightness = float(np.median(facts.changes.brightness))
-    if brightness < DARK:
+    if brightness < DARK_MEAN_GRAY:
         what = f"the images are nearly black: their mean is {255 * brightness:.0f} of 255"
         yield Finding("dark-images", "warning", what, EXPORT)
     if facts.overexposed.mean() > WHITE:

@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.config import DataConfig
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..data.description import read_description, read_record
 from ..data.files import in_order
 from ..data.images import read_color
 from ..footage.components import Image, InOrder, Mask
-from ..footage.pose_fit import PoseFit, View, measure_poses
+from ..footage.depth_unit import UnitGuess, guess_unit
+from ..footage.mask_polarity import Polarity, mask_polarity
+from ..footage.pose_fit import PoseFit, RgbdFrame, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
-from ..footage.units import Polarity, UnitGuess, guess_unit, mask_polarity
 from .finding import About
 
 SAMPLES = 20  # frames for measurements that are expensive
@@ -46,7 +47,7 @@ def about_sequence(sequence: FrameSequence, cfg: DataConfig) -> About:
 
 def sample_frames(sequence: FrameSequence) -> list[Frame]:
     """The frames of which masks and depth are measured."""
-    return [sequence.frame(i) for i in spread(len(sequence), SAMPLES)]
+    return [sequence.frame(i) for i in evenly_spaced(len(sequence), SAMPLES)]
 
 
 def measure_polarity(samples: list[Frame]) -> Polarity:
@@ -80,7 +81,7 @@ def measure_pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
     """Reproject depth between frames with the stored poses; None for a static camera or without enough corners."""
     first = sequence.camera(0)
 
-    def view(index: int) -> View:
+    def view(index: int) -> RgbdFrame:
         frame = sequence.frame(index)
         return frame.rgb_u8, frame.tissue_mask, np.where(frame.depth_valid, frame.depth, np.float32(0))
 

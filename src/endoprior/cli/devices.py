@@ -43,7 +43,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Choice:
+class DeviceChoice:
     """A device, the backend that renders on it, and why it was chosen."""
 
     device: Literal["cpu", "cuda"]
@@ -96,13 +96,13 @@ def _end(process: subprocess.Popen) -> None:
 
 
 @cache
-def choose(wanted: Wanted) -> Choice:
+def choose(wanted: Wanted) -> DeviceChoice:
     """The device and the backend: gsplat where it works and is compiled, else Triton where that works, else the CPU.
 
     InputError if "cuda" is wanted and no backend works on it.
     """
     if wanted == "cpu":
-        return Choice("cpu", "numba", "CPU: as requested")
+        return DeviceChoice("cpu", "numba", "CPU: as requested")
     if not (problem := why_no_gpu()):
         from ..render import ON_GPU
 
@@ -110,13 +110,13 @@ def choose(wanted: Wanted) -> Choice:
         for backend in ON_GPU:
             trial = try_backend(backend) if find_spec(backend) else Trial(False, "not installed")
             if trial.works:
-                return Choice("cuda", backend, f"CUDA: {trial.found.partition(';')[0]}")
+                return DeviceChoice("cuda", backend, f"CUDA: {trial.found.partition(';')[0]}")
             failed.append(f"{backend}: {trial.found}")
         problem = "; ".join(failed)
     if wanted == "cuda":
         fix = "`endoprior doctor` and docs/gpu.md tell more."
         raise input_error("--device cuda", "a GPU that renders", problem, fix)
-    return Choice("cpu", "numba", f"CPU: {problem}")
+    return DeviceChoice("cpu", "numba", f"CPU: {problem}")
 
 
 def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False) -> RenderedScene:

@@ -16,7 +16,7 @@ from .paths import folder_of, open_gaussians, sequence_if_there
 from .progress import Counting
 
 if TYPE_CHECKING:
-    from ..export.formats import Format
+    from ..export.formats import ExportFormat
     from ..model.scene import Scene
 
 
@@ -69,7 +69,7 @@ class Export(ExportOptions, Command):
         if scene.lengths_are_relative:
             say("note: the scale of this scene is assumed. Its lengths are not millimeters.")
 
-    def _words(self, scene: Scene, name: str, chosen: Format) -> str:
+    def _words(self, scene: Scene, name: str, chosen: ExportFormat) -> str:
         """What was written; without --format also what else a file of this suffix can hold, and how to get that."""
         from ..export.formats import formats_of, load_format
 

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from ..core.checks import input_error, number_ranges
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.shell import command
 from ..system.console import say
 from .arguments import Command
@@ -89,7 +89,7 @@ class Masks(Command):
                 found = segment_sequence(sequence, segmenter, work, refine=self.refine, progress=progress)
             for i, (mask, tools) in enumerate(found):
                 rows.append(FrameRow.of(i, tools))
-                put(i, mask, tools.mask, f"{rows[i].share:.1%}")
+                put(i, mask, tools.tool_mask, f"{rows[i].share:.1%}")
         write_rows(self.data, rows)
         count = sum(row.share > 0 for row in rows)
         note_found_masks(self.data, count / len(rows), segmenter.name if segmenter else "")
@@ -140,7 +140,7 @@ def _replacing(
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import mask_sheet, write_png
 
-    shown, pictures, camera = {*spread(len(sequence), SHOWN), *also_shown}, [], sequence.camera(0)
+    shown, pictures, camera = {*evenly_spaced(len(sequence), SHOWN), *also_shown}, [], sequence.camera(0)
 
     def put(i: int, mask: NDArray[np.bool_], tools: NDArray[np.bool_], caption: str, is_new: bool = True) -> None:
         if is_new:

@@ -91,7 +91,7 @@ scale_by_power_of_two = _elementwise(2, _scale)
 
 
 @intrinsic
-def splat(_typing: Any, value: Any) -> Any:
+def broadcast(_typing: Any, value: Any) -> Any:
     """The number in every lane."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -233,9 +233,9 @@ def power_of_two(exponent):
     # 2^exponent; meaningless outside of [-126, 127].
     whole = floor(exponent)
     f = exponent - whole
-    series = fma(splat(_E5), f, splat(_E4))
-    series = fma(series, f, splat(_E3))
-    series = fma(series, f, splat(_E2))
-    series = fma(series, f, splat(_E1))
-    series = fma(series, f, splat(_E0))
+    series = fma(broadcast(_E5), f, broadcast(_E4))
+    series = fma(series, f, broadcast(_E3))
+    series = fma(series, f, broadcast(_E2))
+    series = fma(series, f, broadcast(_E1))
+    series = fma(series, f, broadcast(_E0))
     return scale_by_power_of_two(series, whole)

@@ -40,6 +40,6 @@ class Checked:
                 check_range(name, part, *allowed)
 
 
-def spread(count: int, wanted: int) -> list[int]:
+def evenly_spaced(count: int, wanted: int) -> list[int]:
     """At most `wanted` different positions of 0..count-1, ascending and evenly spaced, both ends included."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, wanted)).round()})

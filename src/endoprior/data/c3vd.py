@@ -21,7 +21,7 @@ from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .files import list_files, read_table
-from .formats import Format
+from .formats import DatasetFormat
 from .images import read_color, read_values
 from .poses import demand_rotations, world_to_camera
 from .reading import read_text
@@ -192,4 +192,4 @@ def _number(file: Path) -> int:
     return int(digits[0])
 
 
-FORMAT = Format(is_c3vd, load_c3vd)
+FORMAT = DatasetFormat(is_c3vd, load_c3vd)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from .files import IMAGE_SUFFIXES, entries, named_file
-from .formats import Format
+from .formats import DatasetFormat
 from .lens import MODELS, Lens
 from .posed_images import PosedImage, load_posed
 from .reading import read_bytes, read_text
@@ -187,4 +187,4 @@ def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
     return load_posed(path, cfg, model, posed, files, remarks)
 
 
-FORMAT = Format(is_colmap, load_colmap)
+FORMAT = DatasetFormat(is_colmap, load_colmap)

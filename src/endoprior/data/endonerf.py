@@ -20,7 +20,7 @@ from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import frame_weights, intrinsics_of, read_description
 from .files import CONFIDENCE, IMAGE_SUFFIXES, list_files, read_json
-from .formats import Format
+from .formats import DatasetFormat
 from .frame_files import Kind, files_of_images, missing_numbers, one_per_frame
 from .images import (
     DEPTH_SUFFIXES,
@@ -273,7 +273,7 @@ def is_plain(path: Path) -> bool:
     return folder.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in folder.iterdir())
 
 
-FORMAT = Format(is_endonerf, load_endonerf)
-STEREOMIS = Format(is_stereomis, load_stereomis)
-NO_DEPTH = Format(is_without_depth, load_plain)  # what `prepare --depth none` leaves, to add depth to
-PLAIN = Format(is_plain, load_plain)
+FORMAT = DatasetFormat(is_endonerf, load_endonerf)
+STEREOMIS = DatasetFormat(is_stereomis, load_stereomis)
+NO_DEPTH = DatasetFormat(is_without_depth, load_plain)  # what `prepare --depth none` leaves, to add depth to
+PLAIN = DatasetFormat(is_plain, load_plain)

@@ -34,7 +34,7 @@ IN_ENDONERF = ("stereomis", "no_depth", "plain")  # names in its module: layouts
 
 
 @dataclass(frozen=True)
-class Format:
+class DatasetFormat:
     """One folder layout."""
 
     recognizes: Callable[[Path], bool]  # whether a folder has this layout, by the names in it alone
@@ -42,17 +42,22 @@ class Format:
 
 
 def _problem(found: Any) -> str:
-    return "" if isinstance(found, Format) else f"an object of type {type(found).__name__}"
+    return "" if isinstance(found, DatasetFormat) else f"an object of type {type(found).__name__}"
 
 
-def _load(name: str) -> Format:
+def _load(name: str) -> DatasetFormat:
     if name in IN_ENDONERF:
         return getattr(import_module(".endonerf", __package__), name.upper())
     return import_module(f".{name}", __package__).FORMAT
 
 
-REGISTRY: Registry[Format] = Registry(
-    "datasets", "a Format of endoprior.data.formats", _problem, modules=FORMATS, load_module=_load, reserved=("auto",)
+REGISTRY: Registry[DatasetFormat] = Registry(
+    "datasets",
+    "a DatasetFormat of endoprior.data.formats",
+    _problem,
+    modules=FORMATS,
+    load_module=_load,
+    reserved=("auto",),
 )
 """The layouts above, and those of plugins."""
 

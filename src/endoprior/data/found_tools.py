@@ -24,7 +24,7 @@ FIX = "remove the file, or find the tools again: `endoprior masks DATA`."
 class FoundTools:
     """The tools of one frame."""
 
-    mask: NDArray[np.bool_]  # (H, W) True on the tools
+    tool_mask: NDArray[np.bool_]  # (H, W)
     confidence: float
     """0..1: how far the probabilities of all pixels that may be a tool are from one half, on average; 1 if none may."""
 
@@ -47,7 +47,7 @@ class FrameRow:
     @classmethod
     def of(cls, frame: int, found: FoundTools) -> FrameRow:
         """The row of a frame in which `found` was found."""
-        return cls(frame, float(found.mask.mean()), float(found.confidence))
+        return cls(frame, float(found.tool_mask.mean()), float(found.confidence))
 
     @classmethod
     def read(cls, file: Path, value: Any) -> FrameRow:

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import DataConfig
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Camera
 from ..footage.border import find_outside
 from .assemble import Pixels, assemble, kept_frames
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
-from .formats import Format
+from .formats import DatasetFormat
 from .frame_files import Kind, files_of_images
 from .images import read_color, read_depth_file, read_tool_mask
 from .poses import MATRIX_FILE, identity_poses, matrix_of_images, read_camera_matrix
@@ -75,7 +75,7 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     kept = kept_frames(len(images), cfg, having=columns)
     images = [images[i] for i in kept]
     depths, *masks = ([files[i] for i in kept] for files in columns)
-    margin = find_outside([read_color(images[i], size)[:, crop:] for i in spread(len(images), SAMPLES)]).mask
+    margin = find_outside([read_color(images[i], size)[:, crop:] for i in evenly_spaced(len(images), SAMPLES)]).mask
     if margin.any():
         remarks.append(f"{path}: a black margin, {margin.mean():.0%} of a frame, is no tissue")
 
@@ -158,4 +158,4 @@ def is_hamlyn(path: Path) -> bool:
     return (path / "images").is_dir() and (own_depth or own_camera or (bare and _is_named(path)))
 
 
-FORMAT = Format(is_hamlyn, load_hamlyn)
+FORMAT = DatasetFormat(is_hamlyn, load_hamlyn)

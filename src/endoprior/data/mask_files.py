@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..footage.units import Polarity, mask_polarity
+from ..footage.mask_polarity import Polarity, mask_polarity
 from .images import Size, decode_image
 from .reading import read_only_array
 
@@ -24,7 +24,7 @@ JPEG_ERROR = 32  # largest compression error next to an outline, in levels 0..25
 FLAT_ERROR = 2  # largest compression error inside of a region
 MOST_LABELS = 32  # with more values, those near the lowest and the highest one are compression errors
 MOST_AREA = 0.5  # labels that cover a larger share of the images may be tissue as well
-LEAST_SHARE = 0.05  # values between that are a smaller share of such an area are errors, not labels
+MIN_LABEL_SHARE = 0.05  # values between that are a smaller share of such an area are errors, not labels
 COLOR = 1 << 56
 """Colors are numbers from here on, with 16 bits for each of red, green and blue; black and grays are their level."""
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
@@ -114,7 +114,7 @@ def high_values(tally: Tally) -> HighValues:
         return two if known else HighValues(0, labels=tuple(numbers), doubt=f"the colors {names(numbers)}")
     area = sum(count for number, count in tally.pixels.items() if number > margin)
     share = area / sum(tally.pixels.values())
-    if share > MOST_AREA and 0 in tally.pixels and count < LEAST_SHARE * area:
+    if share > MOST_AREA and 0 in tally.pixels and count < MIN_LABEL_SHARE * area:
         return HighValues(half)
     doubt = f"the labels {names(numbers)}, those above 0 on {share:.0%} of the pixels"
     known = 0 in tally.pixels and share <= MOST_AREA

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from .files import named_file, read_json, read_matrix
-from .formats import Format
+from .formats import DatasetFormat
 from .images import read_color
 from .lens import COEFFICIENTS, Lens
 from .posed_images import PosedImage, load_posed
@@ -131,4 +131,4 @@ def _parameters(file: Path, image: Path, stored: dict[str, Any]) -> tuple[dict[s
     return values, model or ("OPENCV" if values.keys() & {*COEFFICIENTS} else "PINHOLE")
 
 
-FORMAT = Format(is_nerfstudio, load_nerfstudio)
+FORMAT = DatasetFormat(is_nerfstudio, load_nerfstudio)

@@ -31,7 +31,7 @@ class PosedImage:
     file: Path
     lens: Lens
     world_to_camera: NDArray[np.float64]  # (4, 4), OpenCV axes
-    mask: Path | None = None  # 0 = not to be used, as reconstruction programs have it
+    tissue_mask_file: Path | None = None  # 0 = not to be used, as reconstruction programs have it
     depth: Path | None = None  # in mm; positions are in m then
     time: float | None = None
 
@@ -118,7 +118,7 @@ def _sorted(posed: list[PosedImage]) -> list[PosedImage]:
 
 def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple[Mapping[int, Path | None], int]:
     """The mask of each image, None where all of it is tissue, and the value of tools; nothing without any masks."""
-    named = {i: each.mask for i, each in enumerate(posed)}
+    named = {i: each.tissue_mask_file for i, each in enumerate(posed)}
     if any(named.values()):
         if without := list(named.values()).count(None):
             remarks.append(f"{path}: {without} of {len(named)} images name no mask, all of them counts as tissue")

@@ -21,7 +21,7 @@ from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .files import list_files, read_json, read_matrix
-from .formats import Format
+from .formats import DatasetFormat
 from .images import read_color, read_values
 from .poses import demand_rotations
 from .sequence import FrameSequence
@@ -177,4 +177,4 @@ def _rectifying_rotation(record: Path, about: dict[str, Any], size: tuple[int, i
     return np.asarray(cv2.stereoRectify(left, straight, right, straight, size, turn, shift[:, None])[0], np.float64)
 
 
-FORMAT = Format(is_scared, load_scared)
+FORMAT = DatasetFormat(is_scared, load_scared)

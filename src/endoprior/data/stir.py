@@ -21,7 +21,7 @@ from ..core.types import Frame
 from ..system.atomic import whole_file
 from .description import RECORD, read_record
 from .endonerf import load_endonerf
-from .formats import Format
+from .formats import DatasetFormat
 from .images import decode_image, single_channel
 from .reading import kind_of
 from .sequence import FrameSequence
@@ -150,4 +150,4 @@ def write_stir_tracks(clip: Path, prepared: Path) -> Path:
     return target
 
 
-FORMAT = Format(is_stir, load_stir)
+FORMAT = DatasetFormat(is_stir, load_stir)

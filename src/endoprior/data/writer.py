@@ -30,18 +30,18 @@ NOTE = "changes.json"  # In the folder of the original masks: the files that wer
 POSES, BACKUP = "poses_bounds.npy", "poses_bounds_before.npy"
 
 
-def replace_masks(sequence: FrameSequence, masks: Mapping[int, NDArray[np.bool_]]) -> None:
+def replace_masks(sequence: FrameSequence, tool_masks: Mapping[int, NDArray[np.bool_]]) -> None:
     """Write masks, (H, W) True on tools, to their files; the first original of each goes to `masks_before` beside them.
 
-    If the sequence has no mask files yet, their folder is made; `masks` must then hold every frame.
+    If the sequence has no mask files yet, their folder is made; `tool_masks` must then hold every frame.
     """
     files, tool_value = writable_masks(sequence), sequence.mask_tool_value
     folder = files[0].parent
     kept = folder.with_name(f"{folder.name}_before")
     folder.mkdir(exist_ok=True)
-    for frame, mask in masks.items():
+    for frame, tool_mask in tool_masks.items():
         _keep_first(files[frame], kept / files[frame].name)
-        write_mask(files[frame], mask, tool_value)
+        write_mask(files[frame], tool_mask, tool_value)
     if not kept.exists():
         return
     changed = {}
@@ -72,10 +72,10 @@ def writable_masks(sequence: FrameSequence) -> list[Path]:
     return files
 
 
-def write_mask(file: Path, mask: NDArray[np.bool_], tool_value: int) -> None:
+def write_mask(file: Path, tool_mask: NDArray[np.bool_], tool_value: int) -> None:
     """Write one mask, (H, W) True on tools, atomically; `tool_value` is that of tools in the file, 255 or 0."""
     with whole_file(file) as temporary:
-        save_png(temporary, np.where(mask == (tool_value == 255), 255, 0).astype(np.uint8))
+        save_png(temporary, np.where(tool_mask == (tool_value == 255), 255, 0).astype(np.uint8))
 
 
 def note_found_masks(folder: Path, with_tools: float, followed_by: str = "") -> None:

@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from ..core.checks import InputError, input_error
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..data.description import read_description
 from ..data.files import IMAGE_SUFFIXES, files_with
@@ -26,7 +26,7 @@ from ..data.images import read_color
 from ..data.mask_files import MASK_SUFFIXES, demand_known, read_user_mask, rule_of_files, tool_polarity
 from ..data.reading import kind_of
 from ..footage.border import find_outline
-from ..footage.components import Image, Mask, components, distance_inside, grown
+from ..footage.components import Image, Mask, components, dilated, distance_inside
 from ..footage.text_network import TextDetector
 from ..footage.texts import resting_rectangles
 from ..system.atomic import write_json
@@ -121,7 +121,7 @@ class TrueMasks:
         elif self._rule.labels:
             self._tool_is_high, self.polarity = True, self._rule.note
         else:
-            some = [self.indices[i] for i in spread(len(self.indices), SAMPLES)]
+            some = [self.indices[i] for i in evenly_spaced(len(self.indices), SAMPLES)]
             highs = [read_user_mask(self._files[i], self._size, self._rule) for i in some]
             polarity = tool_polarity("auto", highs, [sequence.frame(i).rgb_u8 for i in some])
             self._tool_is_high, self.polarity = polarity.tool_is_high, polarity.reason
@@ -142,8 +142,8 @@ def _demand_same_frames(folder: Path, masks: Mapping[int, Path], sequence: Frame
     except InputError:  # images of other names cannot tell
         return
     pairs = [(images[image], indices[mask]) for mask, image in beside.files.items()]
-    others = {index: _thumbnail(sequence.frame(index).rgb_u8) for index in spread(len(sequence), SAMPLES)}
-    checked, wrong = spread(len(pairs), SAMPLES), []
+    others = {index: _thumbnail(sequence.frame(index).rgb_u8) for index in evenly_spaced(len(sequence), SAMPLES)}
+    checked, wrong = evenly_spaced(len(pairs), SAMPLES), []
     for file, index in (pairs[place] for place in checked):
         image = _thumbnail(read_color(file))
         here = np.abs(image - _thumbnail(sequence.frame(index).rgb_u8)).mean()
@@ -177,7 +177,7 @@ def score_masks(sequence: FrameSequence, truth: TrueMasks) -> MaskEvaluation:
     for index in truth.indices:
         always_found &= ~sequence.frame(index).tissue_mask
         always_true &= truth.tool(index)
-    samples = [sequence.frame(index).rgb_u8 for index in spread(len(sequence), SAMPLES)]
+    samples = [sequence.frame(index).rgb_u8 for index in evenly_spaced(len(sequence), SAMPLES)]
     counted = counted_pixels(samples, always_found | always_true)
     total, tools, rows = Counter[str](), 0, []
     for index in truth.indices:
@@ -294,7 +294,7 @@ def boundary(mask: Mask, counted: Mask) -> Mask:
     image and of the pixels that count are no outline.
     """
     mask = mask & counted
-    return mask & grown(counted & ~mask, CROSS)
+    return mask & dilated(counted & ~mask, CROSS)
 
 
 def near(pixels: Mask) -> Mask:
@@ -314,7 +314,7 @@ def tips(truth: Mask, counted: Mask) -> Mask:
     truth = truth & counted
     parts, _ = components(np.pad(~counted, 1, constant_values=True), 4)
     outside = parts == parts[0, 0]  # a rim around the image, and what does not count and hangs together with it
-    distance = _distance_from_entry(truth, truth & grown(outside, CROSS)[1:-1, 1:-1])
+    distance = _distance_from_entry(truth, truth & dilated(outside, CROSS)[1:-1, 1:-1])
     regions, _ = components(truth)
     reached = np.isfinite(distance)
     farthest = np.zeros(regions.max() + 1)

@@ -42,7 +42,7 @@ TOOLS_MISSED = (0.05, 0.15)
 
 
 @dataclass(frozen=True)
-class Facts:
+class VerdictFacts:
     """What the verdict needs beside scores."""
 
     share_used: float = 1.0
@@ -73,7 +73,7 @@ class Verdict:
         return f"{self.word}: {'; '.join(self.reasons)}"
 
 
-def verdict_on(scores: Mapping[str, float], facts: Facts) -> Verdict:
+def verdict_on(scores: Mapping[str, float], facts: VerdictFacts) -> Verdict:
     """The verdict on a model. Args: scores: of held-out frames, by name (docs/scores.md)."""
     seen = [*_images(scores), *_frames(facts)]
     motion = [*_motion(scores, facts)]
@@ -119,7 +119,7 @@ def _images(scores: Mapping[str, float]) -> Iterator[tuple[int, str]]:
         yield min(by_flow, _graded(-tissue, [-limit for limit in TISSUE_DB])), f"{told}, {words}"
 
 
-def _motion(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, str]]:
+def _motion(scores: Mapping[str, float], facts: VerdictFacts) -> Iterator[tuple[int, str]]:
     """Whether tissue goes where the video shows it going, and the camera where it went."""
     if (slip := scores.get("slip_px")) is not None:
         yield _graded(slip, SLIP_PX), f"tissue slips by {slip:.1f} px in 12 frames against the flow"
@@ -129,7 +129,7 @@ def _motion(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, st
         yield DOUBTFUL, "the camera moves and its path is unknown: depth and motion of tissue are mixed up"
 
 
-def _depth(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, str]]:
+def _depth(scores: Mapping[str, float], facts: VerdictFacts) -> Iterator[tuple[int, str]]:
     """Whether depth agrees with what the moving camera saw, or was measured by two."""
     error = scores.get("depth_triangulated_error")
     if error is not None:
@@ -144,7 +144,7 @@ def _depth(scores: Mapping[str, float], facts: Facts) -> Iterator[tuple[int, str
         yield USABLE, "depth is a guess from one eye that nothing confirms: do not trust views from the side"
 
 
-def _frames(facts: Facts) -> Iterator[tuple[int, str]]:
+def _frames(facts: VerdictFacts) -> Iterator[tuple[int, str]]:
     """Whether enough of the video could be used."""
     if facts.share_used < 1:
         least = [-limit for limit in LEAST_FRAMES]

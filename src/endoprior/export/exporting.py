@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ..core.checks import input_error
 from ..core.geometry import length_unit
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import REGISTRY, ExportOptions, Files, Format, Progress, formats_of, load_format, usable_formats
+from .formats import REGISTRY, ExportFormat, ExportOptions, Files, Progress, formats_of, load_format, usable_formats
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene, Scene
@@ -76,7 +76,7 @@ def _option(field: str) -> str:
     return f"--{field.replace('_', '-')}"
 
 
-def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:
+def _by_suffix(out: Path, options: ExportOptions, chosen: ExportFormat) -> str:
     """The value of the option that chooses between the format's suffixes: as given, else as the file is named."""
     given, option = getattr(options, chosen.suffix_option), _option(chosen.suffix_option)
     named = out.suffix.removeprefix(".") if out.suffix in chosen.suffixes else None
@@ -86,7 +86,7 @@ def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:
 
 
 def _write_time_steps(
-    scene: Scene, out: Path, options: ExportOptions, chosen: Format, files: Files, progress: Progress
+    scene: Scene, out: Path, options: ExportOptions, chosen: ExportFormat, files: Files, progress: Progress
 ) -> None:
     from .time_steps import selected_time_steps  # which takes long to import
 

@@ -52,7 +52,7 @@ TIME_STEP_OPTIONS = ("times", "split", "frame")
 
 
 @dataclass(frozen=True)
-class Format:
+class ExportFormat:
     """One export format: what it writes, and which options it takes. Either `files` or `write` is set."""
 
     suffixes: tuple[str, ...]
@@ -80,19 +80,19 @@ class Format:
 
 
 def _problem(found: Any) -> str:
-    if not isinstance(found, Format):
+    if not isinstance(found, ExportFormat):
         return f"an object of type {type(found).__name__}"
     has_one = (found.files is None) != (found.write is None)
-    return "" if has_one else "a Format with both or none of files and write"
+    return "" if has_one else "an ExportFormat with both or none of files and write"
 
 
-def _built_in(name: str) -> Format:
+def _built_in(name: str) -> ExportFormat:
     module, _, variable = FORMATS[name].partition(":")
     return getattr(import_module(f".{module}", __package__), variable)
 
 
-REGISTRY: Registry[Format] = Registry(
-    "exporters", "a Format of endoprior.export.formats", _problem, modules=tuple(FORMATS), load_module=_built_in
+REGISTRY: Registry[ExportFormat] = Registry(
+    "exporters", "an ExportFormat of endoprior.export.formats", _problem, modules=tuple(FORMATS), load_module=_built_in
 )
 """The formats above, and those of plugins."""
 RANGES = {
@@ -166,7 +166,7 @@ class ExportOptions:
         return self.frame or "opencv"
 
 
-def load_format(name: str) -> Format:
+def load_format(name: str) -> ExportFormat:
     """The format of that name; imports its module.
 
     Raises:
@@ -178,7 +178,7 @@ def load_format(name: str) -> Format:
     return REGISTRY.load(name)
 
 
-def usable_formats() -> dict[str, Format]:
+def usable_formats() -> dict[str, ExportFormat]:
     """Every format that can be used, by name, plugins last."""
     return {name: REGISTRY.load(name) for name in FORMATS} | dict(REGISTRY.usable())
 

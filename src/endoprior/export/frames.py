@@ -20,7 +20,7 @@ from ..system.atomic import whole_folder, write_json, write_text
 from ..visualization.image_tools import to_u8
 from ..visualization.video import write_video
 from .axes import points_in_axes
-from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format, Progress
+from .formats import TIME_STEP_OPTIONS, Axes, ExportFormat, ExportOptions, Progress
 from .time_steps import TimeStep, frame_indices, selected_time_steps
 
 MM_PER_M = 1000.0
@@ -126,15 +126,17 @@ def write_scene(scene: Scene, out: Path, _options: ExportOptions, progress: Prog
     progress(1, 1)
 
 
-DEPTH = Format(
+DEPTH = ExportFormat(
     suffixes=(".png", ".npy"),
     options=("times", "split", "min_alpha"),
     files=depth,
     index_facts={"png_unit_mm": 1 / PNG_STEPS_PER_MM, "npy_unit_mm": 1.0, "missing": 0},
     holds="depth",
 )
-CAMERAS = Format(suffixes=(".json",), options=TIME_STEP_OPTIONS, write=write_cameras, holds="cameras")
-TUM = Format((".tum",), ("times", "split"), write=write_tum, holds="the path of the camera", note=path_note)
-KITTI = Format((".kitti",), ("times", "split"), write=write_kitti, holds="the path of the camera", note=path_note)
-VIDEO = Format(suffixes=(".mp4",), options=("split",), write=write_rendered, holds="a video")
-SCENE = Format(suffixes=(".safetensors",), options=(), write=write_scene, holds="the whole scene, motion included")
+CAMERAS = ExportFormat(suffixes=(".json",), options=TIME_STEP_OPTIONS, write=write_cameras, holds="cameras")
+TUM = ExportFormat((".tum",), ("times", "split"), write=write_tum, holds="the path of the camera", note=path_note)
+KITTI = ExportFormat((".kitti",), ("times", "split"), write=write_kitti, holds="the path of the camera", note=path_note)
+VIDEO = ExportFormat(suffixes=(".mp4",), options=("split",), write=write_rendered, holds="a video")
+SCENE = ExportFormat(
+    suffixes=(".safetensors",), options=(), write=write_scene, holds="the whole scene, motion included"
+)

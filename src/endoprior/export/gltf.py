@@ -23,7 +23,7 @@ from ..model.gaussians import SH_C0
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .axes import points_in_axes
-from .formats import TIME_STEP_OPTIONS, ExportOptions, Format, Progress
+from .formats import TIME_STEP_OPTIONS, ExportFormat, ExportOptions, Progress
 from .mesh import SURFACE_OPTIONS, surface_mesh
 from .ply import GAUSSIAN_OPTIONS, splats_of, unit_quaternions
 from .time_steps import TimeStep, seconds_of_motion, selected_time_steps
@@ -208,8 +208,10 @@ def blender_note(scene: Scene, out: Path, options: ExportOptions) -> str:
     return f"a .glb file does not say which frames to play. In Blender's Python console, type: {code}"
 
 
-GAUSSIANS = Format((".glb",), GAUSSIAN_OPTIONS, gaussians, default_axes="opengl", holds="Gaussians", read=decode_glb)
-ANIMATION = Format(
+GAUSSIANS = ExportFormat(
+    (".glb",), GAUSSIAN_OPTIONS, gaussians, default_axes="opengl", holds="Gaussians", read=decode_glb
+)
+ANIMATION = ExportFormat(
     suffixes=(".glb",),
     options=(*TIME_STEP_OPTIONS, *SURFACE_OPTIONS),
     write=write_animation,

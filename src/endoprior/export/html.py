@@ -47,7 +47,7 @@ from ..render.projection import color_slopes
 from ..render.sh import colors
 from ..system.atomic import whole_file
 from ..system.parallel import frame_threads
-from .formats import ExportOptions, Format, Progress
+from .formats import ExportFormat, ExportOptions, Progress
 
 DATA_FORMAT = "endoprior-player-2"
 """Name and version of the data in the page."""
@@ -386,4 +386,4 @@ def _zigzag(residual: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return ((signed << 1) ^ (signed >> 15)).view(np.uint16)
 
 
-FORMAT = Format((".html",), ("times", "title", "max_mb"), write=write, holds="a player")
+FORMAT = ExportFormat((".html",), ("times", "title", "max_mb"), write=write, holds="a player")

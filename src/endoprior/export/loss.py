@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from .. import render
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Splats
 from ..model.scene import Scene
 from .axes import ROTATIONS, rotated
-from .formats import ExportOptions, Format
+from .formats import ExportFormat, ExportOptions
 from .time_steps import TimeStep, selected_time_steps
 
 MOST_FRAMES = 3
@@ -21,7 +21,7 @@ INVISIBLE_DB = 60.0
 """At this PSNR the error is a quarter of a step of 8 bits."""
 
 
-def loss_note(scene: Scene, out: Path, options: ExportOptions, chosen: Format) -> str:
+def loss_note(scene: Scene, out: Path, options: ExportOptions, chosen: ExportFormat) -> str:
     """PSNR of a few of the files just written against the scene, in one line; empty for a format that is not read.
 
     Both are rendered as the endoscope sees them, without smoke.
@@ -29,7 +29,7 @@ def loss_note(scene: Scene, out: Path, options: ExportOptions, chosen: Format) -
     if chosen.read is None:
         return ""
     steps = selected_time_steps(scene, options)
-    some = [steps[k] for k in spread(len(steps), MOST_FRAMES)]
+    some = [steps[k] for k in evenly_spaced(len(steps), MOST_FRAMES)]
     back = ROTATIONS[options.frame or chosen.default_axes].T
     errors = []
     for step in some:

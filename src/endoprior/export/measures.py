@@ -23,7 +23,7 @@ from ..model.uncertainty import point_errors
 from ..system.atomic import whole_folder
 from ..visualization.measures import displacement_span, measures_csv, stretch_span, value_colors, write_figure
 from .axes import points_in_axes
-from .formats import ExportOptions, Format, Progress
+from .formats import ExportFormat, ExportOptions, Progress
 from .mesh import depth_grid
 from .ply import colored, ply_bytes
 from .tracks import back_projected, read_query_points
@@ -155,7 +155,7 @@ def _array(name: str, array: NDArray) -> str:
     return f'<DataArray type="{VTK_KINDS[array.dtype.str]}" Name="{name}"{rows} format="binary">{body}</DataArray>'
 
 
-FORMAT = Format(
+FORMAT = ExportFormat(
     (),
     ("frame", "points", "from_frame", "to_frame", "mesh_step", "max_slope", "min_alpha"),
     write=write,

@@ -21,12 +21,12 @@ from scipy.sparse.csgraph import connected_components
 
 from ..core.checks import input_error
 from ..core.geometry import back_project, length_unit, pixel_centers, project
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Camera
 from ..model.scene import Scene
 from ..model.surface import Surface, render_surface
 from .axes import points_in_axes
-from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format
+from .formats import TIME_STEP_OPTIONS, Axes, ExportFormat, ExportOptions
 from .ply import colored, ply_bytes
 from .time_steps import TimeStep
 
@@ -183,7 +183,7 @@ def viewpoints(cameras: tuple[Camera, ...]) -> list[Camera]:
     different = list(kept.values())
     if len(different) < 2:
         raise input_error("--mesh-method tsdf", "several camera positions", "one", "use --mesh-method grid.")
-    return [different[i] for i in spread(len(different), MAX_VIEWS)]
+    return [different[i] for i in evenly_spaced(len(different), MAX_VIEWS)]
 
 
 def fused_mesh(views: list[Surface], voxel_mm: float) -> Mesh:
@@ -278,7 +278,7 @@ def _triangles_of(corners: NDArray[np.intp], values: NDArray) -> NDArray[np.intp
     return np.concatenate([corners[num_inside == count][:, cut] for count, cut in _CUTS])
 
 
-FORMAT = Format(
+FORMAT = ExportFormat(
     suffixes=(".ply", ".obj", ".stl"),
     options=(*TIME_STEP_OPTIONS, "mesh_format", *SURFACE_OPTIONS),
     files=files,

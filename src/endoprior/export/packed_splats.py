@@ -28,7 +28,7 @@ from ..core.types import Splats
 from ..model.gaussians import SH_C0
 from ..model.scene import Scene
 from ..render.sh import degree_of
-from .formats import Axes, ExportOptions, Format
+from .formats import Axes, ExportFormat, ExportOptions
 from .ply import GAUSSIAN_OPTIONS, ply_elements, splats_of, unit_quaternions, when
 from .time_steps import TimeStep
 
@@ -367,18 +367,18 @@ def _bytes(values: NDArray) -> NDArray[np.uint8]:
 
 def _format(
     suffix: str, encode: Callable[[Splats], bytes], decode: Callable[[bytes], Splats], axes: Axes = "opencv"
-) -> Format:
+) -> ExportFormat:
     """A format of one file for each time step that says nothing of axes and time."""
 
     def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
         return {suffix: encode(step.plain_splats(scene, options.axes))}
 
-    return Format((suffix,), GAUSSIAN_OPTIONS, files, default_axes=axes, holds="Gaussians", read=decode)
+    return ExportFormat((suffix,), GAUSSIAN_OPTIONS, files, default_axes=axes, holds="Gaussians", read=decode)
 
 
 SOG, SPLAT = _format(".sog", encode_sog, decode_sog), _format(".splat", encode_splat, decode_splat)
 SPZ = _format(".spz", encode_spz, decode_spz, "opengl")
-COMPRESSED_PLY = Format(
+COMPRESSED_PLY = ExportFormat(
     (".ply",),
     GAUSSIAN_OPTIONS,
     compressed_ply,

@@ -18,7 +18,7 @@ from ..core.types import Splats
 from ..model.scene import Scene
 from ..render import sh as harmonics
 from .axes import points_in_axes
-from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format
+from .formats import TIME_STEP_OPTIONS, Axes, ExportFormat, ExportOptions
 from .time_steps import TimeStep
 
 LEAST_OPACITY = 1e-7
@@ -159,7 +159,7 @@ def ply_bytes(
 
 
 GAUSSIAN_OPTIONS = (*TIME_STEP_OPTIONS, "canonical")
-PLY = Format(
+PLY = ExportFormat(
     suffixes=(".ply",),
     options=GAUSSIAN_OPTIONS,
     files=gaussians,
@@ -167,4 +167,4 @@ PLY = Format(
     read=decode_ply,
     has_index=False,  # SuperSplat plays a folder as a sequence only if it holds nothing else
 )
-POINTS = Format((".ply",), (*GAUSSIAN_OPTIONS, "min_opacity"), points, holds="colored points")
+POINTS = ExportFormat((".ply",), (*GAUSSIAN_OPTIONS, "min_opacity"), points, holds="colored points")

@@ -29,7 +29,7 @@ from ..model.scene import Scene
 from ..model.uncertainty import LEVEL, PointErrors, point_errors
 from ..system.atomic import whole_file
 from .axes import points_in_axes
-from .formats import ExportOptions, Format, Progress
+from .formats import ExportFormat, ExportOptions, Progress
 from .mesh import SURFACE_OPTIONS, Mesh, encode_mesh, surface_mesh
 from .time_steps import TimeStep, seconds_of_motion, selected_time_steps
 from .tracks import back_projected, read_query_points
@@ -249,4 +249,6 @@ def _stored(played: Played, number: int, file: str, **references: Element) -> li
     return [storage, _node(played.tag, number, played.name, {}, storage=storage, **references)]
 
 
-FORMAT = Format((".mrb",), ("times", "split", "points", *SURFACE_OPTIONS), write=write, holds="a sequence of meshes")
+FORMAT = ExportFormat(
+    (".mrb",), ("times", "split", "points", *SURFACE_OPTIONS), write=write, holds="a sequence of meshes"
+)

@@ -19,7 +19,7 @@ from ..model.surface import Surface, depth_at, project_visible, render_surface, 
 from ..model.uncertainty import LEVEL, point_errors
 from ..system.atomic import whole_folder
 from .axes import points_in_axes
-from .formats import ExportOptions, Format, Progress
+from .formats import ExportFormat, ExportOptions, Progress
 
 COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence", "across95", "along95")
 
@@ -149,4 +149,4 @@ def _table(
     return text.getvalue()
 
 
-FORMAT = Format((), ("frame", "points", "grid_px", "min_alpha", "data"), write=write, holds="tracks of points")
+FORMAT = ExportFormat((), ("frame", "points", "grid_px", "min_alpha", "data"), write=write, holds="tracks of points")

@@ -26,7 +26,7 @@ from ..render.constants import NEAR_Z
 from ..render.sh import degree_of
 from ..system.atomic import temporary_sibling, whole_file
 from .axes import points_in_axes
-from .formats import Axes, ExportOptions, Format, Progress
+from .formats import Axes, ExportFormat, ExportOptions, Progress
 from .gltf import decoded_srgb
 from .mesh import SURFACE_OPTIONS, Mesh, surface_mesh
 from .ply import unit_quaternions
@@ -221,7 +221,7 @@ def how_to_see(_scene: Scene, _out: Path, _options: ExportOptions) -> str:
     )
 
 
-FORMAT = Format(
+FORMAT = ExportFormat(
     suffixes=(".usdz", ".usdc"),
     options=("times", "split", *SURFACE_OPTIONS),
     write=write,

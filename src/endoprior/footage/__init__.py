@@ -1,1 +1,1 @@
-"""Image analysis of a clip, as pure functions: borders, labels, motion, changes, stereo order, mask polarity, units."""
+"""Image analysis of a clip, as pure functions: borders, labels, motion, changes, stereo order, masks, depth unit."""

@@ -21,12 +21,12 @@ does not move with the view."""
 FINE_SIGMA_PX, COARSE_SIGMA_PX = 1.5, 10.0  # detail between these scales is compared, px of the finest images
 OUTLIER = 2.5  # residuals beyond this many standard deviations count little (Geman-McClure)
 ROUNDS, CONVERGED_PX = 12, 0.02  # steps of Gauss-Newton on each level at most, and the step that ends them
-LEAST_SHARE, FEWEST_PX = 0.3, 100.0  # of the usable pixels, those that both images show, and their least number
+MIN_OVERLAP_SHARE, MIN_OVERLAP_PX = 0.3, 100.0  # share of the usable pixels that both images show, and their number
 LEAST_GAIN = 0.2  # contrast of one image as a multiple of the other's
 AGREEMENT = 0.6  # correlation of the aligned images; other scenes reach 0.45
 SURE_PX = 0.5  # standard deviation of the mean shift, px of the finest images
-RETURN_PX = 1.5  # distance between the way there and the way back, px of the finest images
-DARK = 24  # gray level below which what touches the edge of both images is a border, which does not move
+ALIGNMENT_ROUND_TRIP_PX = 1.5  # distance between the way there and the way back, px of the finest images
+BORDER_GRAY_LEVEL = 24  # gray level below which what touches the edge of both images is a border, which does not move
 COARSEST_PX = 2  # least side of the coarsest images, px: OpenCV correlates none that are smaller
 RIM_PX = 5  # what lies nearer to it than this is not used either, px of the finest images
 
@@ -49,7 +49,7 @@ def align(
     shape = pair[0].detail.shape
     there = _similarity(*pair)
     back = None if there is None else _similarity(*pair[::-1])  # on its own: a wrong way there has no way back
-    if there is None or back is None or mean_shift(back @ there, shape[1], shape[0]) > RETURN_PX:
+    if there is None or back is None or mean_shift(back @ there, shape[1], shape[0]) > ALIGNMENT_ROUND_TRIP_PX:
         return None
     # Pixel centers count from 0, and images shrink about their corner.
     scale = np.array([[factor, 0, (factor - 1) / 2], [0, factor, (factor - 1) / 2], [0, 0, 1]])
@@ -88,7 +88,7 @@ class _Level:
 
 def _border(brighter: Image) -> Mask:
     """(h, w) True on the dark border of a clip and near it, from the brighter values of two images."""
-    dark = brighter < DARK
+    dark = brighter < BORDER_GRAY_LEVEL
     labels, boxes = components(dark)
     edge = np.zeros(len(boxes), bool)
     edge[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
@@ -143,7 +143,7 @@ def _refined(before: _Level, now: _Level, p: NDArray) -> _Fit | None:
     y, x = np.mgrid[:height, :width].astype(np.float32)
     u, v = x - (width - 1) / 2, y - (height - 1) / 2
     reach = float(np.sqrt((u * u + v * v).mean()))
-    needed, best = max(LEAST_SHARE * float(before.usable.sum()), FEWEST_PX), None
+    needed, best = max(MIN_OVERLAP_SHARE * float(before.usable.sum()), MIN_OVERLAP_PX), None
     for _ in range(ROUNDS):
         matrix, flags = _matrix(p, (height, width))[:2], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         shown = cv2.warpAffine(now.detail, matrix, (width, height), flags=flags)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import AREA, Image, Mask, components, disk, distance_inside, grown, regions_where, square
+from .components import AREA, Image, Mask, components, dilated, disk, distance_inside, regions_where, square
 from .dark_outline import Circle, Darkness, blurred, brightness, find_darkness, reduced
 from .round_border import find_circle
 
@@ -44,7 +44,7 @@ class Outside:
     sharpness: float = 1.0  # share 0..1 of the outline that is sharp; below `CERTAIN` the border is uncertain
     level: float = 0.0  # brightness 0..255 that it does not exceed
     images: int = 1  # number of images in the frame, of which the largest is taken
-    moves: bool = False  # whether single samples show less: see `beyond`
+    moves: bool = False  # whether single samples show less: see `hidden_by_moving_border`
 
 
 def find_outside(images: Sequence[Image], inside: Mask | None = None) -> Outside:
@@ -70,12 +70,12 @@ def find_outside(images: Sequence[Image], inside: Mask | None = None) -> Outside
     if not alike:
         return Outside(np.zeros_like(inside))
     found = _cut(usual, alike[len(alike) // 2], darkness, inside)
-    found = replace(found, mask=grown(found.mask, disk(_rim(usual, found.mask, inside))) & inside)
-    moved = [beyond(image, found.level, inside & ~found.mask).mean() for image in images]
+    found = replace(found, mask=dilated(found.mask, disk(_rim(usual, found.mask, inside))) & inside)
+    moved = [hidden_by_moving_border(image, found.level, inside & ~found.mask).mean() for image in images]
     return replace(found, moves=float(np.median(moved)) > MOVES)
 
 
-def beyond(image: Image, level: float, inside: Mask) -> Mask:
+def hidden_by_moving_border(image: Image, level: float, inside: Mask) -> Mask:
     """(H, W) True where one image (H, W, 3) shows nothing though others do there: the border moves, as in a video of a
     screen.
 
@@ -84,7 +84,7 @@ def beyond(image: Image, level: float, inside: Mask) -> Mask:
         inside: (H, W) True where the clip shows something.
     """
     found = _cut(blurred(brightness(image)), level, Darkness(0.0, level / 4), inside).mask
-    return grown(found, square(LEAST_REACH_PX)) & inside if found.any() else found
+    return dilated(found, square(LEAST_REACH_PX)) & inside if found.any() else found
 
 
 def _levels(usual: Image, darkness: Darkness) -> list[float]:
@@ -112,8 +112,8 @@ def _cut(gray: Image, level: float, darkness: Darkness, inside: Mask) -> Outside
     sharp = high >= np.maximum(np.maximum(RATIO * low, low + 4 * darkness.step), MOST_OF * beside)
     around, notch = inside & ~convex, convex & ~picture
     distance = distance_inside(np.pad(convex, 1))[1:-1, 1:-1]  # the edge of the image counts
-    cut, cut_line, cut_clear = _parts(around, around & grown(convex, square(1)), sharp)
-    edge = notch & grown(picture, square(1)) & (distance > reach)
+    cut, cut_line, cut_clear = _parts(around, around & dilated(convex, square(1)), sharp)
+    edge = notch & dilated(picture, square(1)) & (distance > reach)
     notches, line, clear = _parts(notch, edge, sharp, distance)
     others = int((areas >= ANOTHER * areas.max()).sum())
     return Outside(cut | notches, (cut_clear + clear) / max(cut_line + line, 1), level, others)
@@ -220,7 +220,7 @@ def _outline(images: Sequence[Image], circle: Circle | None) -> Outline:
 def _explains(circle: Circle, outline: Outline) -> bool:
     """Whether most of the outline lies on the circle, or opposite parts do; edges of frame and strips do not count."""
     shown = ~(outline.outside | outline.in_strip)
-    y, x = np.nonzero(shown & grown(~shown, square(1)) & ~grown(outline.in_strip, square(1)))
+    y, x = np.nonzero(shown & dilated(~shown, square(1)) & ~dilated(outline.in_strip, square(1)))
     if not len(x):
         return True
     toward = np.stack([x + 0.5 - circle.center_x, y + 0.5 - circle.center_y], 1)

@@ -21,7 +21,6 @@ from .optical_flow import follow_both_ways
 WORK_WIDTH = 320  # Images are resized to this width, px: enough for hundreds of corners, and fast
 MAX_CORNERS = 400
 MIN_TRACKS = 24  # With fewer tracked corners, no motion is estimated for a pair of images
-RETURN_PX = 1.0  # Followed to the next image and back, a corner returns within this distance
 MIN_INLIERS = 0.4  # Share of corners that must be inliers; below, camera motion does not explain the pair
 SHOWN = 0.9  # Share of images that must be linked to one another before the camera counts as static
 FEW_CORNERS = 0.3  # Share of the explained steps that only direct alignment explains, above which corners are too few
@@ -177,7 +176,7 @@ def _step(before: _Seen, now: _Seen) -> NDArray | None:
     if found is None or len(found) < MIN_TRACKS:
         return None
     corners = np.asarray(found[:, 0], np.float32)
-    there, good = follow_both_ways(before.gray, now.gray, corners, RETURN_PX, side_px=15)
+    there, good = follow_both_ways(before.gray, now.gray, corners, side_px=15)
     if good.sum() < MIN_TRACKS:
         return None
     cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator

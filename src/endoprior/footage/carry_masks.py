@@ -18,7 +18,7 @@ from ..core.checks import check_shape
 from .components import Image, Mask
 from .optical_flow import MIN_SIZE_PX, flow_pair, flow_shrink, gray_for_flow
 
-RETURN_PX, RETURN_SHARE = 1.5, 0.1
+CARRY_ROUND_TRIP_PX, CARRY_ROUND_TRIP_SHARE = 1.5, 0.1
 """A pixel returns if forward and backward flow disagree by at most this, px of the flow, plus this share of the step.
 DIS is exact to a fraction of a pixel where it follows the image, and wrong by several pixels where it does not."""
 LEAST_RETURNING = 0.5
@@ -121,7 +121,7 @@ def _follow(first: Image, second: Image, region: Mask) -> tuple[float, Positions
     onward, back = flow_pair(first, second)
     small, grid = _at_size(region, first), _grid(*first.shape)
     error, step = (np.hypot(each[..., 0], each[..., 1]) for each in (onward + sampled(back, grid + onward), onward))
-    returns = error <= RETURN_PX + RETURN_SHARE * step
+    returns = error <= CARRY_ROUND_TRIP_PX + CARRY_ROUND_TRIP_SHARE * step
     share = float(np.average(returns, weights=small)) if small.any() else 0.0
     return share, _origins(small, onward, returns) if share else grid
 

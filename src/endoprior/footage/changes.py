@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .components import Image, InOrder, Mask, runs
 from .disturbances import FrameQuality, disturbances, measure_quality, small_size
-from .scenes import REACH, View, change, jumps, places_differ, same_view, standardized
+from .scenes import REACH, ImageFeatures, change, jumps, places_differ, same_view, standardized
 from .scenes import THUMB_WIDTH as SCENE_WIDTH
 
 THUMB_WIDTH = 160  # Images are compared at this width, px
@@ -196,4 +196,4 @@ def _is_cut(thumbs: Sequence[NDArray], small: Sequence[NDArray[np.float32]], fir
     if not places_differ(small[max(first - REACH, 0) : first], small[first : first + REACH]):
         return False
     places = [[first - k for k in ACROSS if k <= first], [first - 1 + k for k in ACROSS if first - 1 + k < len(thumbs)]]
-    return not same_view(*([View(thumbs[i].astype(np.uint8)) for i in side] for side in places))
+    return not same_view(*([ImageFeatures(thumbs[i].astype(np.uint8)) for i in side] for side in places))

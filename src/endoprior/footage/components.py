@@ -39,7 +39,7 @@ def large_regions(mask: Mask, least_px: float, connectivity: int = 8) -> Mask:
     return regions_where(boxes[:, AREA] >= least_px, labels)
 
 
-def grown(mask: Mask, kernel: NDArray[np.uint8]) -> Mask:
+def dilated(mask: Mask, kernel: NDArray[np.uint8]) -> Mask:
     """(H, W) True where the kernel, centered there, meets the mask."""
     return cv2.dilate(mask.astype(np.uint8), kernel) > 0
 

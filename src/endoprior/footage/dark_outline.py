@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.ranges import spread
-from .components import Image, Mask, grown, large_regions, square
+from ..core.ranges import evenly_spaced
+from .components import Image, Mask, dilated, large_regions, square
 
 WORKING_SIDE_PX = 640  # Larger images are reduced for the first guess; the circle is measured in full images later
 FEW = 9  # Number of images that tell what black is
@@ -86,7 +86,7 @@ def reduced(grays: Sequence[Image]) -> tuple[list[Image], float]:
 
 def find_darkness(grays: Sequence[Image]) -> Darkness | None:
     """Level and noise of the darkest region of (H, W) images; None if it is too bright for a border."""
-    smooth = np.stack([blurred(grays[i]) for i in spread(len(grays), FEW)])
+    smooth = np.stack([blurred(grays[i]) for i in evenly_spaced(len(grays), FEW)])
     typical = np.partition(smooth, (len(smooth) - 1) // 2, axis=0)[(len(smooth) - 1) // 2]
     darkest = float(np.quantile(typical, DARKEST_SHARE))
     if darkest >= MOST_BLACK:
@@ -103,7 +103,7 @@ def outline_points(grays: Sequence[Image], darkness: Darkness) -> tuple[Points, 
     inward: list[Points] = [np.empty((0, 2))]
     for gray in grays:
         dark = large_regions(blurred(gray) <= darkness.level + darkness.step, LEAST_REGION * gray.size, 4)
-        edge = grown(dark, square(1)) & ~dark & ~_lines(dark)
+        edge = dilated(dark, square(1)) & ~dark & ~_lines(dark)
         edge[:2] = edge[-2:] = edge[:, :2] = edge[:, -2:] = False
         y, x = np.nonzero(edge)
         if not len(x):

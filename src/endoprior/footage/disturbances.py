@@ -71,7 +71,7 @@ def measure_quality(small: Image, view: Mask) -> FrameQuality:
 
 
 REACH_S = 15.0  # an image is compared with those of its scene up to so long before and after it, s
-DARK = 0.05  # mean gray level, of 1, below which an image is dark
+DARK_MEAN_GRAY = 0.05  # mean gray level, of 1, below which an image is dark
 WHITE_OUT = 0.5  # share of white pixels from which on an image is overexposed
 UNFOCUSED, BLUR_RATIO = 0.3, 0.45
 """An image is blurred if its focus is below the first, or below this share of that of its neighbors."""
@@ -99,8 +99,8 @@ def disturbances(
     for i, time in enumerate(seconds):
         first, end = np.searchsorted(seconds, [time - REACH_S, time + REACH_S], side="left")
         near = np.arange(first, end)
-        near = near[(scene[near] == scene[i]) & (brightness[near] >= DARK) & (overexposed[near] < WHITE_OUT)]
-        if brightness[i] < DARK:
+        near = near[(scene[near] == scene[i]) & (brightness[near] >= DARK_MEAN_GRAY) & (overexposed[near] < WHITE_OUT)]
+        if brightness[i] < DARK_MEAN_GRAY:
             words[i], weights[i] = "dark", FLOOR_WEIGHT
         elif overexposed[i] >= WHITE_OUT:
             words[i], weights[i] = "overexposed", FLOOR_WEIGHT
@@ -121,7 +121,7 @@ def scenes_outside(measured: Sequence[FrameQuality], scene: NDArray[np.integer])
     Color alone does not tell: tissue can be gray or blue. It must also differ from the rest of the clip, and vary.
     """
     values = np.array(measured, np.float64).reshape(-1, len(FrameQuality._fields))
-    usable = values[:, 0] >= DARK
+    usable = values[:, 0] >= DARK_MEAN_GRAY
     if not usable.any():
         return set()
     red, green, hues = values[:, 5:8].T

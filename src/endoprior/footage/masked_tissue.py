@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from .background_motion import difference_from_background
 from .components import AREA, Image, InOrder, Mask, components, disk, distance_inside
 from .optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
@@ -23,7 +23,7 @@ COMPARED, FEWEST = 24, 8  # pairs of frames; with fewer in which the tissue move
 MOVES_PX = 1.0  # the tissue moves if its median flow is above this, px
 WITH_TISSUE = 0.3  # difference to the motion of the tissue, as a share of that: 0.04 on tissue, 1 on tools (medians)
 NEARLY_ALL = 0.9  # share of the pairs
-LEAST_SHARE = 0.003  # smaller regions, as a share of the image, are not judged
+MIN_MASKED_REGION_SHARE = 0.003  # smaller regions, as a share of the image, are not judged
 INNER_PX = 2  # rims of regions mix both motions
 
 
@@ -46,7 +46,7 @@ def find_masked_tissue(
         each: as `map`; threads can give the results, in order.
     """
     ahead = max(1, round(MOTION_S * frames_per_second))
-    first = spread(count - ahead, COMPARED) if count > ahead else []
+    first = evenly_spaced(count - ahead, COMPARED) if count > ahead else []
     found = list(each(lambda i: _likest(color(i), color(i + ahead), tool(i), tool(i + ahead)), first))
     moving = [(i, ratio, place) for i, (speed, ratio, place) in zip(first, found, strict=True) if speed > MOVES_PX]
     alike = [(i, place) for i, ratio, place in moving if ratio < WITH_TISSUE]
@@ -79,7 +79,7 @@ def _likest(first: Image, later: Image, tool: Mask, tool_later: Mask) -> tuple[f
     labels, boxes = components(inner)
     best = nothing[1:]
     for i in range(1, len(boxes)):
-        if boxes[i, AREA] >= LEAST_SHARE * tissue.size:
+        if boxes[i, AREA] >= MIN_MASKED_REGION_SHARE * tissue.size:
             region = labels == i
             ratio = float(np.median(difference[region])) / max(speed, 1e-6)
             best = min(best, (ratio, _middle(region, shrink)))

@@ -19,8 +19,10 @@ MOTION_S = 0.1
 """Time between two frames that show how tissue moves, s: long enough for a breath to move it by a pixel."""
 HALVED_FROM_PX = 256
 """Flow of frames with at least this shorter side is computed at half size: four times faster, almost as accurate."""
-STUCK_PX, STUCK = 3.0, 0.3
-"""Where the image goes by the first or more, px at a width of 640, a point that goes less than this share is stuck."""
+FIXED_IN_IMAGE_PX, FIXED_IN_IMAGE_SHARE = 3.0, 0.3
+"""Where the image goes by the first or more, px at a width of 640, a point that goes less than this share is
+fixed in the image."""
+MAX_FORWARD_BACKWARD_PX = 1.0  # Largest forward-backward error of a corner that counts as followed
 FINE_SIDE_PX = 256  # Fine flow is computed on images shrunk by a whole number to at least this shorter side
 
 
@@ -70,23 +72,23 @@ def _estimator() -> cv2.DISOpticalFlow:
     return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
 
-def stuck(way: NDArray, expected: NDArray, width: int) -> Mask:
+def fixed_in_image(way: NDArray, expected: NDArray, width: int) -> Mask:
     """(...) True where a point stays while the scene moves: flow saw the border, the lens or fibers, not tissue.
 
     Args:
-        way: (..., 2) how far flow carries points; NaN is not stuck. expected: (..., 2) how far the scene goes, px.
+        way: (..., 2) how far flow carries points; NaN is not fixed. expected: (..., 2) how far the scene goes, px.
         width: of the image, px.
     """
     far, gone = np.linalg.norm(expected, axis=-1), np.linalg.norm(way, axis=-1)
-    return (far > STUCK_PX * width / 640) & (gone < STUCK * far)
+    return (far > FIXED_IN_IMAGE_PX * width / 640) & (gone < FIXED_IN_IMAGE_SHARE * far)
 
 
 def follow_both_ways(
     first: Image,
     second: Image,
     pixels: NDArray[np.float32],
-    return_px: float,
     *,
+    max_error_px: float = MAX_FORWARD_BACKWARD_PX,
     side_px: int = 21,
     halvings: int = 3,
     guess: NDArray[np.float32] | None = None,
@@ -95,7 +97,7 @@ def follow_both_ways(
     """Where the second gray image shows pixels (N, 2) of the first, and (N,) False where the way back leads elsewhere.
 
     Args:
-        return_px: followed back, x and y of a pixel come back within this distance, or it counts as lost.
+        max_error_px: largest forward-backward error of x and of y, px; above it a pixel counts as lost.
         side_px: side of the window that is compared.
         halvings: how often the images are halved; it bounds the motion that is found.
         guess: (N, 2) where to start in the second image; without it at `pixels`.
@@ -110,5 +112,5 @@ def follow_both_ways(
     there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, pixels, start, **options)
     home = None if guess is None else pixels + there - guess
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, home, **options)
-    kept = (found & found_back).ravel().astype(bool) & (np.abs(back - pixels).max(1) < return_px)
+    kept = (found & found_back).ravel().astype(bool) & (np.abs(back - pixels).max(1) < max_error_px)
     return there, kept

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from .components import AREA, Image, Mask, components, grown, regions_where, square
+from .components import AREA, Image, Mask, components, dilated, regions_where, square
 
 PURE, BOLD, FAINT = 0.25, 190, 110
 """In a pure color the middle channel is nearer to another than this share of the difference of the extreme ones. That
@@ -40,9 +40,9 @@ def find_strokes(image: Image) -> Mask:
     if strokes.sum() < LEAST_STROKES * strokes.size:
         return np.zeros(chroma.shape, bool)
     # Coding dulls the color of thin letters: they belong to the writing that they stand beside.
-    writing, words = components(grown(regions_where(thin, regions), square(NEARBY * width)))
+    writing, words = components(dilated(regions_where(thin, regions), square(NEARBY * width)))
     held = np.bincount(writing[strokes], minlength=len(words)) > 0
-    return grown(regions_where(held, writing) & colored | strokes, square(width))
+    return dilated(regions_where(held, writing) & colored | strokes, square(width))
 
 
 def without_strokes(images: Sequence[Image]) -> list[Image]:

@@ -15,18 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry import CONVENTIONS, Convention, to_ours
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from .components import Image, InOrder, square
 from .optical_flow import follow_both_ways
 
-View = tuple[Image, NDArray, NDArray[np.float32]]
+RgbdFrame = tuple[Image, NDArray, NDArray[np.float32]]
 """Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""
 WORK_WIDTH = 320  # Wider images are resized to this width, px
 STARTS = 10  # Number of frames from which corners are followed
 REACH = 24  # ... over so many frames at most ...
 FAR = 0.05  # ... or until they have moved by this share of the image width (median).
 MAX_CORNERS, FEWEST = 200, 40
-RETURN_PX = 1.0
 EDGE_STEP = 0.05  # No corners where depth changes by more than this share between neighbors
 LEAST_PX = 1.0  # Errors below this, px of an image 640 px wide, come from corners and tissue: nothing is wrong
 AS_GOOD = 1.15  # Conventions whose errors differ by less than this factor are not told apart
@@ -123,7 +122,7 @@ class _Tracks:
 
 
 def measure_poses(
-    view: Callable[[int], View],
+    view: Callable[[int], RgbdFrame],
     matrix: NDArray[np.float64],
     poses: NDArray[np.float64],
     given: Convention = "opencv",
@@ -148,7 +147,7 @@ def measure_poses(
     factor = min(1.0, WORK_WIDTH / width)
     px = 640 / (factor * width)
     matrix = np.diag([factor, factor, 1]) @ matrix + [[0, 0, (factor - 1) / 2], [0, 0, (factor - 1) / 2], [0, 0, 0]]
-    starts = spread(len(poses) - 1, STARTS)
+    starts = evenly_spaced(len(poses) - 1, STARTS)
 
     def follow(start: int) -> _Tracks | None:
         return _follow(lambda j: _small(view(j), factor), matrix, start, len(poses))
@@ -194,7 +193,7 @@ def _best_unit(error: Callable[[float], float]) -> float:
     return plain or min((unit * FINER).tolist(), key=error)
 
 
-def _small(view: View, factor: float) -> View:
+def _small(view: RgbdFrame, factor: float) -> RgbdFrame:
     """Gray image, tissue and depth of a frame at the working size."""
     rgb_u8, tissue, depth = view
     gray = np.asarray(cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -206,7 +205,7 @@ def _small(view: View, factor: float) -> View:
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8), tissue, depth
 
 
-def _follow(view: Callable[[int], View], matrix: NDArray, start: int, count: int) -> _Tracks | None:
+def _follow(view: Callable[[int], RgbdFrame], matrix: NDArray, start: int, count: int) -> _Tracks | None:
     """Follow corners from a frame until they are far away; None if too few are left."""
     gray, tissue, depth = view(start)
     before = _corners(gray, tissue, depth)
@@ -215,7 +214,7 @@ def _follow(view: Callable[[int], View], matrix: NDArray, start: int, count: int
         following, tissue, _ = view(index)
         if len(kept) < FEWEST:
             return None
-        there, good = follow_both_ways(gray, following, pixels, RETURN_PX)
+        there, good = follow_both_ways(gray, following, pixels)
         good &= _sampled(tissue, there) > 0
         if good.sum() < FEWEST:
             break

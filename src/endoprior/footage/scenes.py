@@ -29,7 +29,7 @@ NEAR_PX, LIKE_PX = 2.0, 5.0  # largest distance of a point from where the common
 DISTINCT = 0.8  # a feature is found again if the second best candidate is farther from it by this factor
 
 
-class View:
+class ImageFeatures:
     """One small gray image (h, w), see `disturbances.small_size`, and its features once they are asked for."""
 
     def __init__(self, gray: Image, inside: Mask | None = None) -> None:
@@ -51,7 +51,7 @@ class View:
         return places, np.zeros((0, 128), np.float32) if like is None else np.asarray(like, np.float32)
 
 
-class Link(NamedTuple):
+class GlobalMotion(NamedTuple):
     """The common motion from one image to another."""
 
     shift: float  # mean shift of 9 points spread over the image, as a share of its width
@@ -59,16 +59,16 @@ class Link(NamedTuple):
     agreement: float  # share of the points that follow it
 
 
-def flow_link(before: View, now: View) -> Link | None:
+def flow_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     """The common motion of corners from an image to the next one; None if too few are found again."""
     corners = before.corners
     if len(corners) < FEWEST:
         return None
-    there, good = follow_both_ways(before.gray, now.gray, corners, 1.0, side_px=15)
+    there, good = follow_both_ways(before.gray, now.gray, corners, side_px=15)
     return _link(corners[good], there[good], len(corners), NEAR_PX, now.gray.shape[1])
 
 
-def feature_link(before: View, now: View) -> Link | None:
+def feature_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     """The common motion of features between any two images; None if too few are found again."""
     (first, first_like), (second, second_like) = before.features, now.features
     if min(len(first), len(second)) < FEWEST:
@@ -79,7 +79,7 @@ def feature_link(before: View, now: View) -> Link | None:
     return _link(a, b, len(found), LIKE_PX, now.gray.shape[1])
 
 
-def _link(a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: float, width: int) -> Link | None:
+def _link(a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: float, width: int) -> GlobalMotion | None:
     if len(a) < FEWEST:
         return None
     cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator
@@ -90,10 +90,10 @@ def _link(a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: floa
     grid = np.stack([x.ravel(), y.ravel()], 1)
     away = np.linalg.norm(a @ matrix[:, :2].T + matrix[:, 2] - b, axis=1)
     shift = np.linalg.norm(grid @ matrix[:, :2].T + matrix[:, 2] - grid, axis=1).mean()
-    return Link(float(shift) / width, float(np.median(away)) / width, float(inliers.sum() / of))
+    return GlobalMotion(float(shift) / width, float(np.median(away)) / width, float(inliers.sum() / of))
 
 
-def same_view(befores: Sequence[View], afters: Sequence[View]) -> bool:
+def same_view(befores: Sequence[ImageFeatures], afters: Sequence[ImageFeatures]) -> bool:
     """Whether images before and after an event, the nearest first, show the same tissue.
 
     By the features of any two, or if the nearest ones can be aligned: smooth tissue has no features.

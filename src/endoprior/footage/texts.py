@@ -22,7 +22,7 @@ LEAST_MEAN_SCORE, RARE, RARE_SCORE = 0.75, 6, 0.9
 """Of the boxes of a text that rests: least mean score, and that of a text in fewer than `RARE` images. The slots of a
 tool that rests for a while have 0.82 in three images."""
 MOST_WANDER = 0.08  # Mean distance of the boxes of a text that rests from their line, in heights: tools have 0.2
-LEAST_SHARE = 0.25  # Of the images from the first to the last one with a text that rests: so many show it
+MIN_SHOWN_SHARE = 0.25  # Of the images from the first to the last one with a text that rests: so many show it
 SAME_PLACE = 0.7  # Boxes that share so much of the smaller one are at one place
 SAME_HEIGHT, SAME_LENGTH = 1.4, 1.25  # Largest ratios of heights, and of lengths, of one text
 LEVEL_DEGREES = 4.0  # Text that moves is level up to this
@@ -72,7 +72,7 @@ class Resting:
         """Whether it is text rather than something that looks like it at times."""
         span = self.seen[-1] - self.seen[0] + 1
         least = LEAST_MEAN_SCORE if len(self.seen) >= RARE else RARE_SCORE
-        if len(self.seen) < max(LEAST_SEEN, LEAST_SHARE * span) or self._score < least:
+        if len(self.seen) < max(LEAST_SEEN, MIN_SHOWN_SHARE * span) or self._score < least:
             return False
         _, across = self._spans()
         return bool(np.abs(across.mean(1) - np.median(across.mean(1))).mean() < MOST_WANDER * self.box.height)

@@ -7,7 +7,7 @@ search (Kroeger et al. 2016, OpenCV) provides an initial motion, which training 
 Chained from frame to frame, flow drifts. The flow straight from an anchor frame to a distant frame does not; it is
 found because its search starts from the flow to the frame between. A point goes from its source frame to an anchor, and
 from there to every other frame: two steps of flow, each checked by the flow back. Of all anchors, the one counts whose
-two steps close best. Where none closes, or a point stays in the image although the camera moves (stuck to a border or
+two steps close best. Where none closes, or a point stays in the image although the camera moves (fixed to a border or
 to fibers), it is lost, and moves as the points around it do (`neighbor_motion`).
 
 `T` training frames, `N` points, `B` basis functions, `h, w` size of the gray images. Pixels are float64 with centers at
@@ -30,7 +30,7 @@ from ..compute.parallel_kernels import parallel_njit
 from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
-from ..footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow, stuck
+from ..footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, gray_for_flow
 from ..system.memory import workers
 from .motion_fit import InitialMotion, fit_motion
 from .neighbor_motion import fill_gaps, smooth_motion
@@ -96,7 +96,7 @@ def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.i
     pixels[error > cycle_limit_px(error / shrink) * shrink] = np.nan
     for t, frame in enumerate(frames):
         rigid, _ = project(points, frame.camera)
-        pixels[t, stuck(pixels[t] - sources, rigid - sources, masks[t].shape[1])] = np.nan
+        pixels[t, fixed_in_image(pixels[t] - sources, rigid - sources, masks[t].shape[1])] = np.nan
     pixels[origins, np.arange(len(points))] = sources
     return pixels
 
@@ -157,7 +157,7 @@ def _composed(first: Flow, second: Flow) -> NDArray[np.float32]:
 
 def _add_tracks(
     flow: AnchorFlow,
-    masks: Sequence[NDArray[np.bool_]],
+    tissue_masks: Sequence[NDArray[np.bool_]],
     sources: NDArray[np.float64],
     origins: NDArray[np.integer],
     limit_px: float,
@@ -167,11 +167,11 @@ def _add_tracks(
     """Follow all points by way of one anchor; update `pixels` (T, N, 2) where the `error` (T, N), px, gets smaller.
 
     Args:
-        masks: (H, W) tissue of each frame. sources: (N, 2) px in the frames `origins` (N,).
+        tissue_masks: (H, W) tissue of each frame. sources: (N, 2) px in the frames `origins` (N,).
     """
 
     def followed(points: NDArray, there: Flow, back: Flow, frame: int) -> tuple[NDArray, NDArray]:
-        return follow(points, there.astype(np.float32), back.astype(np.float32), masks[frame])
+        return follow(points, there.astype(np.float32), back.astype(np.float32), tissue_masks[frame])
 
     there, back = flow.there, flow.back
     at_anchor, first_step = np.full_like(sources, np.nan), np.full(len(sources), np.inf)

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from ..compute.parallel_kernels import parallel_njit
 
-LEAST_SHARE = 0.34  # neighbors carry a point as long as those that are known have this share of the weight
+MIN_KNOWN_WEIGHT_SHARE = 0.34  # neighbors carry a point as long as those that are known have this share of the weight
 CARRIERS = 12  # known points that carry a lost one
 COMPANIONS, COMPANION_STEP = 128, 4
 """A point moves as the mean of its 128 nearest points; every fourth of them is asked, the nearest first."""
@@ -101,7 +101,7 @@ def carry(positions, known, start, step, points, neighbors, weights, age):
                     total += weights[p, k]
                     for c in range(3):
                         moved[c] += weights[p, k] * (positions[t, j, c] - positions[start, j, c])
-            if total < LEAST_SHARE:
+            if total < MIN_KNOWN_WEIGHT_SHARE:
                 ends[p] = t - step
                 break
             for c in range(3):

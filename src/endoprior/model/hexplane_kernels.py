@@ -30,7 +30,7 @@ import numpy as np
 from numba import njit, prange
 
 from ..compute.parallel_kernels import parallel_njit
-from ..compute.simd import LANES, fma, load_some, prefetch, splat, store_some, total
+from ..compute.simd import LANES, broadcast, fma, load_some, prefetch, store_some, total
 from .hexplane import FRESH, TOUCHED
 
 _CHUNK = 64  # Gaussians per task of the gather
@@ -67,7 +67,7 @@ def _find(unit, n, s, layout):
     width, depth = resolution[s, 0], resolution[s, 1]
     cells = (space_start[s, 0] + y * width + x, space_start[s, 1] + z * width + x, space_start[s, 2] + z * depth + y)
     columns = (table_start[s, 0] + x, table_start[s, 1] + y, table_start[s, 2] + z)
-    return cells, columns, (splat(fx), splat(fy), splat(fz)), (slope_x, slope_y, slope_z)
+    return cells, columns, (broadcast(fx), broadcast(fy), broadcast(fz)), (slope_x, slope_y, slope_z)
 
 
 @njit(inline="always")
@@ -264,7 +264,7 @@ def _scatter_block(
     sample_yz, yz_y, yz_z = _bilinear(values, yz, yz + down_y, step, uy, uz, lanes)
     of_z = sample_xz * sample_yz
     space = sample_xy * of_z
-    v_x = v_y = v_z = v_space = splat(_ZERO)
+    v_x = v_y = v_z = v_space = broadcast(_ZERO)
     for m in range(num_times):
         at = m * step + c
         xt, yt, zt = columns[0] * step_t + at, columns[1] * step_t + at, columns[2] * step_t + at

@@ -25,7 +25,7 @@ from .method import config_from, method_of
 from .photometric import GRID
 from .scene import RenderedScene
 from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SceneFacts, camera_arrays, demand
-from .single_scene import FORMAT, SingleScene
+from .single_scene import SCENE_FORMAT, SingleScene
 from .uncertainty import CELLS
 from .windowed_scene import Span, WindowedScene, window_file
 
@@ -59,12 +59,13 @@ def load_scene(path: str | Path) -> RenderedScene:
         stopped = os.path.isfile(path / "config.json")  # of a run, written first
         finish = command("train", "--resume", path) if stopped else command("train", "DATA", path)
         raise input_error(file, "a trained scene", "an unfinished run" if stopped else "none", f"`{finish}`.")
-    arrays, about = load_arrays(file, {FORMAT: scene_schema, windowed_scene.FORMAT: index_schema}, NEXT_STEP)
+    schemas = {SCENE_FORMAT: scene_schema, windowed_scene.WINDOWS_FORMAT: index_schema}
+    arrays, about = load_arrays(file, schemas, NEXT_STEP)
     with rejecting(file, "a scene", NEXT_STEP):
         known = {name: value for name, value in about.items() if name != "format"}
         facts = from_dict(SceneFacts, known | {"config": _config(about)}, "about")
         _check_cameras(arrays)
-        if about["format"] == windowed_scene.FORMAT:
+        if about["format"] == windowed_scene.WINDOWS_FORMAT:
             return _windowed(arrays, facts, file)
         return method_of(facts.config).scene(arrays, _cameras(arrays, facts), facts)
 
@@ -80,11 +81,11 @@ def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
 def _config(about: dict[str, Any]) -> Config:
     """What a scene was trained with; one of both eyes from before there was gloss is as one of the left eye."""
     cfg = config_from(about["config"])
-    of_windows, deformation = about["format"] == windowed_scene.FORMAT, cfg.deformation
+    of_windows, deformation = about["format"] == windowed_scene.WINDOWS_FORMAT, cfg.deformation
     if cfg.method == OWN and deformation.kind == "basis" and not deformation.basis.num_frames and not of_windows:
         got = "radial basis functions, of an earlier version"
         raise InputError(f"config.deformation.basis: expected splines over time; got {got}.")
-    of_one = about["format"] == FORMAT and not about.get("baseline_mm")
+    of_one = about["format"] == SCENE_FORMAT and not about.get("baseline_mm")
     return replace(cfg, data=replace(cfg.data, eyes="left")) if of_one else cfg
 
 

@@ -24,7 +24,7 @@ from .photometric import is_possible
 from .scene import Scene, Window
 from .scene_facts import MOST_GAUSSIANS, SceneFacts, camera_arrays, demand, scene_facts
 
-FORMAT = "endoprior-scene-1"
+SCENE_FORMAT = "endoprior-scene-1"
 """Name and version of the file format, in the file's metadata."""
 
 
@@ -177,4 +177,4 @@ class SingleScene(Scene):
             arrays["tissue"], about["tissue"] = self.tissue, True
         if self.depth_noise:
             about["depth_noise"] = self.depth_noise
-        save_arrays(path, arrays, scene_facts(self) | about, FORMAT)
+        save_arrays(path, arrays, scene_facts(self) | about, SCENE_FORMAT)

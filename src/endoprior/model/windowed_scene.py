@@ -18,7 +18,7 @@ from .scene import Scene, Window
 from .scene_facts import camera_arrays, scene_facts
 from .single_scene import SingleScene
 
-FORMAT = "endoprior-windows-1"
+WINDOWS_FORMAT = "endoprior-windows-1"
 """Name and version of the file that lists the windows, in its metadata."""
 CACHE_BYTES = 2**28
 """Memory of the windows that are kept; a window of 33,000 Gaussians and 60 frames has 60 MB."""
@@ -102,7 +102,7 @@ def window_file(path: Path, k: int) -> Path:
 def save_index(path: Path, scene: WindowedScene) -> None:
     """Write the list of windows only; the windows are in place."""
     spans = torch.tensor([[span.start, span.stop, span.num_gaussians] for span in scene.spans], dtype=torch.int64)
-    save_arrays(path, camera_arrays(scene.cameras) | {"windows": spans}, scene_facts(scene), FORMAT)
+    save_arrays(path, camera_arrays(scene.cameras) | {"windows": spans}, scene_facts(scene), WINDOWS_FORMAT)
 
 
 def _num_bytes(scene: SingleScene) -> int:

@@ -16,7 +16,7 @@ from ..data.writer import FrameFiles, SequenceMeta, new_sequence
 from .camera import STILL, Eye
 from .config import PhantomConfig
 from .events import Event, disturbed, is_mirrored, parse_events, shows_body
-from .scene import Moment, Scene, build_scene
+from .scene import Moment, PhantomScene, build_scene
 from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth, vignette
 from .sheet import tangents
 from .sinus import build_sinus
@@ -71,7 +71,7 @@ _LOOKS = 12
 """Views in each excursion in which tracked points are chosen."""
 
 
-def choose_tracks(scene: Scene) -> NDArray[np.int64]:
+def choose_tracks(scene: PhantomScene) -> NDArray[np.int64]:
     """(P, 2) mesh rows and columns to track: two thirds spread over what is seen, the rest near the pulls.
 
     A camera that stands still has seen enough in the first image.
@@ -98,7 +98,7 @@ def choose_tracks(scene: Scene) -> NDArray[np.int64]:
     return np.stack([rows[chosen], columns[chosen]], -1)
 
 
-def _regions(scene: Scene, tracked: NDArray[np.int64]) -> NDArray[np.str_]:
+def _regions(scene: PhantomScene, tracked: NDArray[np.int64]) -> NDArray[np.str_]:
     """(P,) `pulled`: moved by at least half of a pull; else `smooth`: hardly any texture; else `spread`."""
     share = scene.cfg.smooth_share
     pulled = np.max([pull.weight(scene.a, scene.b) for pull in scene.motion.pulls], 0) >= 0.5
@@ -215,7 +215,7 @@ def write_phantom(
 
 
 def _write_tracks(
-    writer: FrameFiles, scene: Scene, tracked: NDArray[np.int64], points: list[NDArray], visible: list[NDArray]
+    writer: FrameFiles, scene: PhantomScene, tracked: NDArray[np.int64], points: list[NDArray], visible: list[NDArray]
 ) -> None:
     """The tracks, from `points` (P, 3) and `visible` (P,) of each frame; how their tissue is deformed."""
     regions = {"region": _regions(scene, tracked)} if scene.cfg.has_regions else {}
@@ -225,7 +225,7 @@ def _write_tracks(
         writer.write_arrays("truth/mechanics.npz", **_deformed(scene, tracked))
 
 
-def _deformed(scene: Scene, tracked: NDArray[np.int64]) -> dict[str, NDArray[np.float32]]:
+def _deformed(scene: PhantomScene, tracked: NDArray[np.int64]) -> dict[str, NDArray[np.float32]]:
     """What `truth/mechanics.npz` says of the tracked vertices (P, 2); the tissue is undeformed in the first frame."""
     rows, columns = tracked.T
     rest = scene.vertices(0)
@@ -252,7 +252,7 @@ def _disturbed(
     return disturbed(image, events, index, seed), mask, measured, right
 
 
-def _write_dull(writer: FrameFiles, scene: Scene, now: Moment, gain: float, turned: slice) -> None:
+def _write_dull(writer: FrameFiles, scene: PhantomScene, now: Moment, gain: float, turned: slice) -> None:
     """The tissue of a frame without highlights, unless smoke as a kind of tissue veils it."""
     if scene.smoke is None or scene.cfg.smoke:
         radiance, _ = render_tissue(scene, now, STILL, highlights=False)
@@ -264,7 +264,7 @@ def _write_sides(
     writer: FrameFiles,
     sides: dict[str, Eye],
     index: int,
-    seen: tuple[Scene, Moment, NDArray, NDArray, float],
+    seen: tuple[PhantomScene, Moment, NDArray, NDArray, float],
 ) -> None:
     """What the side cameras see of a frame, as `side_view` takes it: picture and depth."""
     scene, now, front_z, tool, gain = seen
@@ -274,7 +274,7 @@ def _write_sides(
         writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
 
 
-def _write_descriptions(writer: FrameFiles, scene: Scene, sides: dict[str, Eye], gains: list[float]) -> None:
+def _write_descriptions(writer: FrameFiles, scene: PhantomScene, sides: dict[str, Eye], gains: list[float]) -> None:
     """Poses of the cameras, the calibration of the pair, and kinds of tools and tissue, where they are not obvious."""
     cfg = scene.cfg
     if scene.path.excursions:

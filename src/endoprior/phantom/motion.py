@@ -78,7 +78,7 @@ class ToolPose:
 
 
 @dataclass(frozen=True)
-class Motion:
+class PhantomMotion:
     """The motion of tissue and tools for one seed."""
 
     plane: Plane
@@ -149,7 +149,7 @@ class Motion:
         return grasper, second
 
 
-def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> Motion:
+def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> PhantomMotion:
     """Choose the motion of one seed: the grasper takes the main_loop loop, each time at another place."""
     rng = np.random.default_rng([cfg.seed, 4])
     side = float(rng.choice([-1.0, 1.0]))
@@ -174,7 +174,7 @@ def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> Motion:
         hover[0], hover[2] = _NEARER * hover[0], hover[2] + _HIGHER_MM  # thin tools would hardly be in the image
     motion = cfg.breathing_mm, cfg.slide_mm, tuple(pulls), np.array(idles), np.array(hover), side
     loads = _loads(cfg, anatomy, pulls)
-    return Motion(plane, anatomy, cfg.frames, *motion, loads, pokes=cfg.mechanics == "poke")
+    return PhantomMotion(plane, anatomy, cfg.frames, *motion, loads, pokes=cfg.mechanics == "poke")
 
 
 def _away(cfg: PhantomConfig, side: float, less: float, along: float, more: float) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ _LABEL, _START_S = "DEMO", 9 * 3600 + 41 * 60 + 7
 
 
 @dataclass(frozen=True)
-class Lens:
+class SampleLens:
     """One camera of the pair."""
 
     matrix: NDArray[np.float64]  # (3, 3) K, px
@@ -62,15 +62,15 @@ class SampleConfig:
         PhantomConfig(seed=self.seed)  # InputError for one out of range
 
     @property
-    def lenses(self) -> tuple[Lens, Lens]:
+    def lenses(self) -> tuple[SampleLens, SampleLens]:
         """The left and the right lens: of one kind, not quite alike."""
         focal, x, y = _FOCAL * self.width, (self.width - 1) / 2, (self.height - 1) / 2
-        left = Lens(
+        left = SampleLens(
             _matrix(focal, x + 0.011 * focal, y - 0.007 * focal), np.array([-0.23, 0.07, 6e-4, -4e-4, 0]), (x, y)
         )
         right = _matrix(1.004 * focal, x - 0.009 * focal, y + 0.006 * focal)
         stop = x - 0.006 * self.width, y + 0.005 * self.width
-        return left, Lens(right, np.array([-0.22, 0.06, -5e-4, 7e-4, 0]), stop)
+        return left, SampleLens(right, np.array([-0.22, 0.06, -5e-4, 7e-4, 0]), stop)
 
     @property
     def rotation(self) -> NDArray[np.float64]:

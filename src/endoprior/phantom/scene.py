@@ -12,7 +12,7 @@ from .camera import CameraPath, Eye, build_camera_path, widened
 from .config import PhantomConfig
 from .instrument_families import instruments_of
 from .instrument_tracing import Instrument
-from .motion import Motion, ToolPose, build_motion, smooth_step
+from .motion import PhantomMotion, ToolPose, build_motion, smooth_step
 from .noise import fractal
 from .raster import vertex_normals
 from .surface import MARGIN, Plane, build_anatomy, build_plane, organs_at, soften
@@ -99,12 +99,12 @@ where the tissue is nearest."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class PhantomScene:
     """The static parts of one synthetic sequence."""
 
     cfg: PhantomConfig
     plane: Plane
-    motion: Motion
+    motion: PhantomMotion
     a: NDArray[np.float64]
     b: NDArray[np.float64]
     height: NDArray[np.float32]
@@ -144,13 +144,13 @@ class Moment:
     phase: float = 0.0
 
     @staticmethod
-    def of(scene: Scene, phase: float) -> Moment:
+    def of(scene: PhantomScene, phase: float) -> Moment:
         """The scene at time `phase` in [0, 1]."""
         vertices = scene.seen_vertices(phase)
         return Moment(scene.endoscope(phase), vertices, vertex_normals(vertices), scene.motion.tools(phase), phase)
 
 
-def build_scene(cfg: PhantomConfig) -> Scene:
+def build_scene(cfg: PhantomConfig) -> PhantomScene:
     """Build anatomy, texture and motion of one seed."""
     plane = build_plane(cfg)
     path = build_camera_path(cfg, plane)
@@ -173,7 +173,7 @@ def build_scene(cfg: PhantomConfig) -> Scene:
     tools = instruments_of(cfg.instruments, cfg.seed)
     strongest = cfg.smoke or look.smoke
     smoke = Smoke.of(cfg, strongest) if strongest > 0 else None
-    return Scene(cfg, plane, motion, a, b, height, texture, path, look, tools, smoke)
+    return PhantomScene(cfg, plane, motion, a, b, height, texture, path, look, tools, smoke)
 
 
 def grid_sizes(cfg: PhantomConfig, plane: Plane) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -90,8 +90,8 @@ def stereo_depth(
     square = np.ones((3, 3), np.uint8)
     # Next to a depth edge (steeper than a slope of 4 per pixel) matching windows cover two surfaces.
     far_edge = z - cv2.erode(z, square) > 2 + 4 * z / cfg.focal
-    spread = [cv2.dilate(where.astype(np.uint8), square) > 0 for where in (far_edge, image.min(-1) >= 246)]
-    missing = spread[0] | spread[1] | _half_occluded(disparity)
+    dilated = [cv2.dilate(where.astype(np.uint8), square) > 0 for where in (far_edge, image.min(-1) >= 246)]
+    missing = dilated[0] | dilated[1] | _half_occluded(disparity)
     return np.where(missing, 0, measured).astype(np.float32)
 
 

@@ -17,7 +17,7 @@ from .camera import STILL, Eye
 from .config import PhantomConfig
 from .instrument_tracing import render_instruments
 from .raster import FAR, rasterize
-from .scene import Moment, Scene
+from .scene import Moment, PhantomScene
 from .sensor import develop, vignette_at
 from .shading import shade
 
@@ -42,7 +42,7 @@ class RenderedView:
     """(H, W) z of the nearest tool sample, mm; FAR where there is none."""
 
 
-def render_view(scene: Scene, now: Moment, eye: Eye) -> RenderedView:
+def render_view(scene: PhantomScene, now: Moment, eye: Eye) -> RenderedView:
     """Render the tissue and the tools of one moment from one camera."""
     n = SUPERSAMPLE
     tissue, z = _tissue_samples(scene, now, eye, eye.center)
@@ -64,7 +64,7 @@ def render_view(scene: Scene, now: Moment, eye: Eye) -> RenderedView:
 
 
 def render_tissue(
-    scene: Scene, now: Moment, eye: Eye, *, highlights: bool = True
+    scene: PhantomScene, now: Moment, eye: Eye, *, highlights: bool = True
 ) -> tuple[NDArray, NDArray[np.float32]]:
     """(H, W, 3) radiance towards the endoscope of the tissue that a camera sees, and (H, W) its z, mm, or `FAR`.
 
@@ -76,7 +76,7 @@ def render_tissue(
 
 
 def _tissue_samples(
-    scene: Scene, now: Moment, eye: Eye, viewer: NDArray[np.float64], highlights: bool = True
+    scene: PhantomScene, now: Moment, eye: Eye, viewer: NDArray[np.float64], highlights: bool = True
 ) -> tuple[NDArray, NDArray]:
     """(SH, SW, 3) radiance towards `viewer` (3,) and (SH, SW) z of every sample."""
     hits, focal, center = sample_hits(eye.sees(now.vertices), scene.cfg)
@@ -144,7 +144,7 @@ def side_eyes(pivot_mm: float) -> dict[str, Eye]:
 
 
 def side_view(
-    scene: Scene, now: Moment, eye: Eye, front_z: NDArray, tool: NDArray[np.bool_], gain: float
+    scene: PhantomScene, now: Moment, eye: Eye, front_z: NDArray, tool: NDArray[np.bool_], gain: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """(H, W, 3) noise-free image of one side camera and (H, W) its depth, mm; 0 where the endoscope sees no tissue.
 

@@ -25,7 +25,7 @@ MOST_NAMED = 3  # other segments that are named
 
 
 @dataclass(frozen=True)
-class Choice:
+class SegmentChoice:
     """A segment of a video, of those that its scan found."""
 
     scanned: dict[str, Any]  # what `scan.json` holds, with a hash of the video's identity
@@ -76,7 +76,7 @@ class Choice:
         ]
 
 
-def choose_segment(video: Path, out: Path, folder_rate: float | None, wanted: int = 0) -> Choice:
+def choose_segment(video: Path, out: Path, folder_rate: float | None, wanted: int = 0) -> SegmentChoice:
     """Scan a video, unless `out` or the folder around it holds its scan; choose the wanted segment, or the best for 0.
 
     Raises:
@@ -89,11 +89,11 @@ def choose_segment(video: Path, out: Path, folder_rate: float | None, wanted: in
     if scanned is None:
         scan = scan_video(video, folder_rate)
         scanned, pictures = as_json(scan) | {"video": identity}, tuple(scan.pictures)
-    choice = Choice(scanned, 0, pictures)
+    choice = SegmentChoice(scanned, 0, pictures)
     count, is_whole = len(choice.segments), len(choice.stretches) == 1
     if not 0 <= wanted <= max(count, 1):
         got = f"{wanted}, with {count} in {video}"
         raise input_error("--segment", "the number of a segment", got, f"`{command('scan', video)}` lists them.")
     if not count or is_whole:
         return choice
-    return Choice(scanned, wanted or best_segment(choice.segments) + 1, pictures)
+    return SegmentChoice(scanned, wanted or best_segment(choice.segments) + 1, pictures)

@@ -27,7 +27,7 @@ from ..prepare.video_clip import FrameSelection, Moment
 from ..prepare.work_folder import work_lock
 from ..system.atomic import reject_occupied, write_json
 from ..system.file_lock import locked
-from .choice import SCAN, Choice, choose_segment
+from .choice import SCAN, SegmentChoice, choose_segment
 
 LEAST_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed
 MOST_FRAMES = 10_000
@@ -122,7 +122,7 @@ class Job(SequenceJob):
     options: Options  # what the user chose, as it is typed: `{"--preview": (), "--end": ("2.5",)}`; all else follows
     prepare: PrepareConfig  # options of `prepare`, for `part` only
     part: Part
-    choice: Choice | None = None  # the segment that was chosen; None if the user chose the part
+    choice: SegmentChoice | None = None  # the segment that was chosen; None if the user chose the part
     rate_is_assumed: bool = False  # whether nothing tells the frame rate of a folder of images
 
     @property

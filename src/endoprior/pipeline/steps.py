@@ -28,7 +28,7 @@ from ..data.pixels import measured_share
 from ..evaluation.context import RenderedFrame, RenderedFrames, SceneFrames
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
-from ..evaluation.verdict import Facts, Verdict, verdict_on
+from ..evaluation.verdict import Verdict, VerdictFacts, verdict_on
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
 from ..footage.components import runs
 from ..model.scene import RenderedScene, Scene
@@ -199,7 +199,7 @@ def _score(job: SequenceJob, progress: Progress, handed_on: HandedOn) -> list[st
     missed, left_out, count = missed_tools_of(job.run) or [], sequence.left_out, len(sequence)
     # Where any frame shows a resting view, only those are used, and one camera is right for them.
     is_unknown = sequence.sources.get(MOTION) == "unknown" and not left_out
-    facts = Facts(
+    facts = VerdictFacts(
         share_used=1 - len(left_out) / count,
         share_with_missed_tools=len(missed) / count,
         lengths_are_relative=sequence.depth_is_relative,

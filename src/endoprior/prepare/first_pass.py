@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..data.reading import kind_of
 from ..footage.border import CERTAIN as SHARP
-from ..footage.border import Circle, Outside, Strips, beyond, find_outline
-from ..footage.components import grown, square
+from ..footage.border import Circle, Outside, Strips, find_outline, hidden_by_moving_border
+from ..footage.components import dilated, square
 from ..footage.overlays import find_strokes, without_strokes
 from ..footage.round_border import CERTAIN
 from ..system.memory import cache_bytes
@@ -29,7 +29,7 @@ from .source import ImageFolder
 from .video_clip import Clip, FrameSelection, StereoFrame
 
 SAMPLES = 24  # number of frames used to detect borders, text, tools and lighting
-DARK, WHITE = 40.0, 230.0
+NEARLY_BLACK_LEVEL, NEARLY_WHITE_LEVEL = 40.0, 230.0
 """Images whose brightest percent of values is below the first are nearly black; darkest above the second, white."""
 Image, Mask, Depth = NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]
 
@@ -64,7 +64,7 @@ class FirstPass:
     stored_size: tuple[int, int] | None = None  # (width, height) of one camera's image of pixels that are not square
     image_names: list[str] = field(default_factory=list)  # of a source folder, without suffixes; empty for a video
     hides: bool = False  # whether drawings in single frames are searched
-    moving_border: float | None = None  # level of a border that moves: see `footage.outside.beyond`
+    moving_border: float | None = None  # level of a border that moves: see `footage.border.hidden_by_moving_border`
     frames: list[StereoFrame] | None = None  # all selected frames, in order; None if they do not fit into memory
     text: BurntInText = field(default_factory=BurntInText)  # what `find_text` found
 
@@ -87,9 +87,9 @@ class FirstPass:
         found = find_strokes(rgb_u8) if self.hides else np.zeros(rgb_u8.shape[:2], bool)
         if index in self.text.boxes:
             text = self.text.mask(index, self.geometry.source_size[::-1])
-            found |= grown(self.geometry.values(text), square(1))  # the rim of the text is mixed with tissue
+            found |= dilated(self.geometry.values(text), square(1))  # the rim of the text is mixed with tissue
         if self.moving_border is not None:
-            found |= beyond(rgb_u8, self.moving_border, self.geometry.inside)
+            found |= hidden_by_moving_border(rgb_u8, self.moving_border, self.geometry.inside)
         return found
 
     def frame_of(self, read: Callable[[tuple[int, int]], NDArray]) -> NDArray:
@@ -129,11 +129,11 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     lefts = [frame.left for frame in samples]
     video_notes = [*clip.notes, *_timing_notes(selection, cfg)]
     brightest = float(np.median([np.percentile(image, 99) for image in lefts]))
-    if brightest < DARK:
+    if brightest < NEARLY_BLACK_LEVEL:
         words = f"their brightest parts have {brightest:.0f} of 255. Export them brighter"
         video_notes.append(f"the images are nearly black: {words}")
     darkest = float(np.median([np.percentile(image, 1) for image in lefts]))
-    if darkest > WHITE:
+    if darkest > NEARLY_WHITE_LEVEL:
         words = f"their darkest parts have {darkest:.0f} of 255. Export them darker, or choose another part"
         video_notes.append(f"the images are nearly white: {words}")
     calibration, name, notes = clip.calibration, str(cfg.calibration), list[str]()

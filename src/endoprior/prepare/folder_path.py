@@ -21,7 +21,7 @@ from ..data.writer import POSES, demand_writable, depth_bounds, pose_table, repl
 from ..footage.changes import find_changes
 from ..system.atomic import write_json
 from .camera_path.sequence_path import AS_OURS, ASSUMED, Reading, path_depth, sequence_path
-from .camera_path.tracks import MOTION, REFINED, CameraPath, Lens, PoseInput
+from .camera_path.tracks import MOTION, REFINED, CameraPath, PoseInput, TrackingCamera
 
 STATIC = "static camera"
 DEPTH_OF_OLD_PATH = "depth was measured by parallax with the path before; `endoprior prepare` measures it anew"
@@ -82,7 +82,7 @@ def write_folder_path(
         lambda i: PoseInput(color(i), tissue(i), read_depth(depths[i], scale, size)),
         lambda: (map(color, range(count)), map(tissue, range(count))),
         count,
-        Lens.centered_at_half(matrix, width, guessed, described.get("baseline_mm")),
+        TrackingCamera.centered_at_half(matrix, width, guessed, described.get("baseline_mm")),
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..footage.border import Circle, Strips
 from ..footage.stereo_order import row_offsets_px
 from .calibration import Calibration, Intrinsics, Size, check_pair
@@ -284,7 +284,7 @@ def with_equal_rows(
     fix, both = "Remove `--row-offset auto`.", [(left, right) for left, right in pairs if right is not None]
     if len(both) < len(pairs):
         raise input_error("--row-offset", "two cameras", "one camera", fix)
-    both = [both[i] for i in spread(len(both), COMPARED)]
+    both = [both[i] for i in evenly_spaced(len(both), COMPARED)]
 
     def offsets(of: FrameGeometry) -> NDArray:
         return np.concatenate([row_offsets_px(of.image(left), of.image(right, right=True)) for left, right in both])

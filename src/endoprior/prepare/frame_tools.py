@@ -97,7 +97,7 @@ def _searched(every: Iterable[Image], inside: Mask, file: Path) -> tuple[NDArray
         with frame_threads(BYTES_PER_PIXEL * inside.size) as pool:
             found = list(ToolFinder().find_over_time(every, inside, pool.map))
         with whole_file(file) as temporary, temporary.open("wb") as out:
-            packed = np.packbits([each.mask for each in found], axis=-1)
+            packed = np.packbits([each.tool_mask for each in found], axis=-1)
             np.savez(out, masks=packed, confidences=[each.confidence for each in found])
     with np.load(file) as stored:
         return np.unpackbits(stored["masks"], axis=-1, count=small_view(inside).shape[1]) > 0, stored["confidences"]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..data import load_sequence
 from ..data.found_tools import FrameRow, write_rows
 from ..data.frame_files import match_files
@@ -25,8 +25,8 @@ from ..data.images import DEPTH_SUFFIXES, read_color, read_depth_file, read_stor
 from ..data.pixels import is_measured
 from ..data.writer import TOOL_VALUE, FrameFiles, found_source, write_mask
 from ..footage.changes import COLOR_DISTANCE, color_share
+from ..footage.depth_unit import guess_unit
 from ..footage.stereo_order import stereo_order, vertical_offset_px
-from ..footage.units import guess_unit
 from ..system.parallel import Pool, frame_threads
 from .config import NETWORK, PrepareConfig
 from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
@@ -90,7 +90,7 @@ def choose_methods(
     if relative:
         images, usable = (
             [f.rgb_u8 for f in samples],
-            [geometry.inside & ~tools(f.index).mask & ~first_pass.hidden(f.index, f.rgb_u8) for f in samples],
+            [geometry.inside & ~tools(f.index).tool_mask & ~first_pass.hidden(f.index, f.rgb_u8) for f in samples],
         )
         if measure is None:
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
@@ -161,7 +161,7 @@ def _measured_depth(
         if not cfg.depth_unit_mm:
             fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
             raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.guess}", "none", fix)
-        some = spread(len(first_pass.indices), FITTED_SAMPLES)
+        some = evenly_spaced(len(first_pass.indices), FITTED_SAMPLES)
         notes += _check_stored([read_stored(files[first_pass.indices[i]]) for i in some])
 
     def read(path: Path, size: tuple[int, int]) -> NDArray:
@@ -289,7 +289,7 @@ def write_frames(
         depth = frame.depth
         if methods.filter_in_time:
             depth = temporal_median([other.depth for other in window if other.depth is not None])
-        tools = methods.tools(frame.index).mask | ~geometry.inside | methods.hidden(frame.index, frame.rgb_u8)
+        tools = methods.tools(frame.index).tool_mask | ~geometry.inside | methods.hidden(frame.index, frame.rgb_u8)
         if methods.shade:
             depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:

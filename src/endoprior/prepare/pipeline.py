@@ -30,7 +30,7 @@ from ..system.parallel import frame_threads
 from .calibration import parse_size
 from .calibration_files import read_calibration
 from .camera_path.sequence_path import ASSUMED, CALIBRATED, Reading, path_depth, sequence_path
-from .camera_path.tracks import CameraPath, Lens, PoseInput
+from .camera_path.tracks import CameraPath, PoseInput, TrackingCamera
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
@@ -250,7 +250,7 @@ def _camera_path(
         files.pose_input,
         lambda: (map(files.color, everything), (~files.tools(i) for i in everything)),
         files.count,
-        Lens.centered_at_half(meta.matrix, meta.width, meta.depth_relative, meta.baseline_mm),
+        TrackingCamera.centered_at_half(meta.matrix, meta.width, meta.depth_relative, meta.baseline_mm),
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
@@ -284,7 +284,7 @@ def _use_parallax(
             files.pose_input,
             np.linalg.inv(path.camera_to_world),
             path.explained,
-            Lens.centered_at_half(meta.matrix, meta.width, meta.depth_relative).matrix,
+            TrackingCamera.centered_at_half(meta.matrix, meta.width, meta.depth_relative).matrix,
             (meta.width, meta.height),
             files.folder / WORK,
             lambda done: progress("depth by parallax", done, files.count),

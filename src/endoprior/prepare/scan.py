@@ -17,8 +17,8 @@ from ..footage.scenes import (
     JUMP,
     REACH,
     THUMB_WIDTH,
-    Link,
-    View,
+    GlobalMotion,
+    ImageFeatures,
     breaks,
     change,
     connected,
@@ -48,7 +48,7 @@ class Look:
 
     seconds: float  # since the first image
     quality: FrameQuality
-    link: Link | None  # motion of the image as a whole since an image before; None: unknown
+    link: GlobalMotion | None  # motion of the image as a whole since an image before; None: unknown
     word: str = ""  # what is wrong with it; empty for nothing
     weight: float = 1.0  # how far it is to be believed, in [0, 1]
 
@@ -155,11 +155,11 @@ class _Watch:
     def __init__(self, inside: NDArray[np.bool_], rate: float) -> None:
         self.pairs: list[tuple[int, int]] = []  # positions of images that show the same tissue
         self._inside, self._count = inside, 0
-        self._views = deque[View](maxlen=max(int(BACK_S * rate), 1))
+        self._views = deque[ImageFeatures](maxlen=max(int(BACK_S * rate), 1))
 
-    def link(self, gray: NDArray[np.uint8]) -> Link | None:
+    def link(self, gray: NDArray[np.uint8]) -> GlobalMotion | None:
         """How the tissue moved since an earlier image."""
-        now, found = View(gray, self._inside), None
+        now, found = ImageFeatures(gray, self._inside), None
         for back in (each for each in BACK if each <= len(self._views)):
             before = self._views[-back]
             found = (flow_link(before, now) if back == 1 else None) or feature_link(before, now)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..footage.background_motion import difference_from_background
 from ..footage.components import InOrder
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
@@ -24,13 +24,14 @@ from ..tool_masks.regions import disk, entering_regions
 
 COMPARED = 24  # number of frames that are compared with a later one
 SIDE_PX = 160
-RETURN_PX, RETURN_SHARE = 0.7, 0.1  # flow forward and back may differ by this, px, plus this share of the step ...
+# Largest forward-backward error of the flow, px, plus this share of the step ...
+MOTION_ROUND_TRIP_PX, MOTION_ROUND_TRIP_SHARE = 0.7, 0.1
 LEAST_AGREEING = 0.8  # ... on this share of the tissue. Where haze or darkness leaves less, nothing can be said.
 # Least difference from the background motion, px, and as a multiple of that of the median pixel. At 1.5 and 5, frames
 # without tools are named in fetoscopy and colonoscopy.
 LEAST_PX, TIMES_MEDIAN = 2.0, 8.0
 NEAR_TOOL_PX = 8  # motion this near to a mask is that of its tool, or of tissue that it pulls
-LEAST_SHARE = 0.01  # smaller regions, as a share of the view, are not reported
+MIN_MOVING_REGION_SHARE = 0.01  # smaller regions, as a share of the view, are not reported
 SMOOTH_PX = 2.0
 Image, Mask = NDArray[np.uint8], NDArray[np.bool_]
 
@@ -47,7 +48,7 @@ def frames_with_unmasked_motion(
         each: as `map`; threads can give the results, in order.
     """
     ahead = max(1, round(MOTION_S * frames_per_second))
-    compared = spread(count - ahead, COMPARED) if count > ahead else []
+    compared = evenly_spaced(count - ahead, COMPARED) if count > ahead else []
 
     def moves(i: int) -> bool:
         # What a tool covers or uncovers has no flow: it counts as masked where the tool is in either frame.
@@ -79,7 +80,7 @@ def moves_unmasked(first: Image, later: Image, view: Mask, tool: Mask) -> bool:
     near = cv2.dilate(tool.astype(np.uint8), disk(NEAR_TOOL_PX)) > 0
     moving = (cv2.GaussianBlur(difference, (0, 0), SMOOTH_PX) > most) & view & ~near
     moving = np.asarray(cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, disk(3)), np.uint8)
-    return bool(entering_regions(moving, view).sum() > LEAST_SHARE * view.sum())
+    return bool(entering_regions(moving, view).sum() > MIN_MOVING_REGION_SHARE * view.sum())
 
 
 def _agree(forward: NDArray[np.float32], backward: NDArray[np.float32]) -> Mask:
@@ -87,4 +88,5 @@ def _agree(forward: NDArray[np.float32], backward: NDArray[np.float32]) -> Mask:
     y, x = np.mgrid[: forward.shape[0], : forward.shape[1]].astype(np.float32)
     there = x + forward[..., 0], y + forward[..., 1]
     back = cv2.remap(backward, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.linalg.norm(forward + back, axis=-1) < RETURN_PX + RETURN_SHARE * np.linalg.norm(forward, axis=-1)
+    error, step = (np.linalg.norm(flow, axis=-1) for flow in (forward + back, forward))
+    return error < MOTION_ROUND_TRIP_PX + MOTION_ROUND_TRIP_SHARE * step

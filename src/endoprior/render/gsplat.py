@@ -58,7 +58,7 @@ KEPT_CAMERAS = 1024
 """Cameras whose numbers stay on the device."""
 
 
-class Lens(NamedTuple):
+class CameraTensors(NamedTuple):
     """The numbers of one camera of each of `B` time steps on the device, float32."""
 
     viewmats: Tensor
@@ -119,17 +119,17 @@ def _render(
     all_means, quats, scales, opacities, coefficients = (torch.stack([getattr(s, n) for s in splats]) for n in FIELDS)
     slopes = torch.stack([color_slopes(each) for each in splats])
     together = Splats(all_means, quats, scales, opacities, coefficients, slopes)
-    lens = _together([lens_of(camera, background.device) for camera in cameras])
-    means = torch.where(_usable(together, lens)[..., None], all_means, lens.behind)
+    tensors = _together([camera_tensors(camera, background.device) for camera in cameras])
+    means = torch.where(_usable(together, tensors)[..., None], all_means, tensors.behind)
     limits = {"eps2d": BLUR_PX2, "near_plane": NEAR_PLANE, "far_plane": OVERFLOW, "opacities": opacities.detach()}
-    seen = lens.viewmats, lens.Ks, width, height
+    seen = tensors.viewmats, tensors.Ks, width, height
     found = gsplat.fully_fused_projection(means, None, quats, scales, *seen, **limits)
     boxes, centers, depths, conics = (each.squeeze(1) for each in found[:4])  # of the one camera of each time step
     kept = (boxes > 0).all(-1)  # rows of the others were never written
     # Each image gets a tensor of its own, whose gradient can be kept.
     means2d = [torch.where(k[:, None], c, 0) for k, c in zip(kept, centers, strict=True)]
     centers = torch.stack(means2d)
-    sh = gsplat.spherical_harmonics(degree, means - lens.center, coefficients, masks=kept)
+    sh = gsplat.spherical_harmonics(degree, means - tensors.center, coefficients, masks=kept)
     z = depths if depth_grad_to_means else depths.detach()
     channels = torch.cat([(sh + 0.5).clamp(min=0), z[..., None]], -1)
     sloped = splats[0].color_slopes is not None
@@ -146,7 +146,7 @@ def _render(
     color = color + (1 - alpha) * background  # given to gsplat, its backward pass reads it at every Gaussian of a pixel
     a, b, c = torch.where(kept[..., None], conics.detach(), 1).unbind(-1)
     det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
-    radii = radii_of(centers, torch.stack([c, -b, a], -1) / det[..., None], opacities, kept, lens.last_pixel)
+    radii = radii_of(centers, torch.stack([c, -b, a], -1) / det[..., None], opacities, kept, tensors.last_pixel)
     return [RenderOutput(*image) for image in zip(color, alpha[..., 0], depth[..., 0], means2d, radii, strict=True)]
 
 
@@ -167,7 +167,7 @@ def _at_pixels(blended: Tensor) -> Tensor:
     return torch.cat([color + x[:, None] * along_x + y[:, None, None] * along_y, z], -1)
 
 
-def lens_of(camera: Camera, device: torch.device) -> Lens:
+def camera_tensors(camera: Camera, device: torch.device) -> CameraTensors:
     """The camera's numbers on that device. Those of cameras seen before are there already: no copy, no waiting."""
     view, (fx, fy, cx, cy) = np.asarray(camera.world_to_camera), (camera.fx, camera.fy, camera.cx, camera.cy)
     slope_x, slope_y = (max(-low, high) for low, high in np.array(jacobian_limits(camera)).reshape(2, 2))
@@ -180,16 +180,16 @@ def lens_of(camera: Camera, device: torch.device) -> Lens:
 
 
 @lru_cache(maxsize=KEPT_CAMERAS)
-def _on_device(numbers: bytes, device: torch.device) -> Lens:
+def _on_device(numbers: bytes, device: torch.device) -> CameraTensors:
     # By value: an array that is changed in place, or an address that is used again, finds no stale numbers.
     parts = torch.from_numpy(np.frombuffer(numbers, np.float32).copy()).to(device).split([16, 9, 3, 3, 2, 1])
     shapes = (1, 1, 4, 4), (1, 1, 3, 3), (1, 1, 3), (1, 1, 3), (1, 1, 2), (1, 1)
-    return Lens(*(part.view(shape) for part, shape in zip(parts, shapes, strict=True)))
+    return CameraTensors(*(part.view(shape) for part, shape in zip(parts, shapes, strict=True)))
 
 
-def _together(lenses: list[Lens]) -> Lens:
-    """The lenses of several time steps as one."""
-    return lenses[0] if len(lenses) == 1 else Lens(*map(torch.cat, zip(*lenses, strict=True)))
+def _together(steps: list[CameraTensors]) -> CameraTensors:
+    """The cameras of several time steps as one."""
+    return steps[0] if len(steps) == 1 else CameraTensors(*map(torch.cat, zip(*steps, strict=True)))
 
 
 @cache
@@ -215,7 +215,7 @@ def _nothing(splats: Splats, camera: Camera, background: Tensor) -> RenderOutput
 
 
 @torch.no_grad()
-def _usable(splats: Splats, lens: Lens) -> Tensor:
+def _usable(splats: Splats, tensors: CameraTensors) -> Tensor:
     """(B, N) False where a number is not finite or could become so; written with `<`, which is False for NaN."""
     numbers = torch.cat([splats.means, splats.quats, splats.scales, splats.opacities[..., None]], -1)
     slopes = color_slopes(splats)
@@ -224,5 +224,5 @@ def _usable(splats: Splats, lens: Lens) -> Tensor:
         & (splats.sh.abs() < LARGEST_SH).flatten(2).all(-1)
         & (slopes.abs() < LARGEST_SH).flatten(2).all(-1)
         & (splats.quats.norm(dim=-1) >= MIN_QUAT)
-        & (splats.scales.amax(-1) < lens.widest * lens.depths(splats.means))
+        & (splats.scales.amax(-1) < tensors.widest * tensors.depths(splats.means))
     )

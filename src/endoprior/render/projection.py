@@ -115,27 +115,27 @@ def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Te
     left, right, top, bottom = jacobian_limits(camera)
     slope_x, slope_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
     axes = view[:3, :3] @ rotation_matrices(splats.quats) * splats.scales[:, None, :]  # columns: the axes, camera frame
-    spread_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])  # rows of J times the axes
-    spread_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
-    xx, xy, yy = (spread_x * spread_x).sum(-1), (spread_x * spread_y).sum(-1), (spread_y * spread_y).sum(-1)
+    axes_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])  # rows of J times the axes
+    axes_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
+    xx, xy, yy = (axes_x * axes_x).sum(-1), (axes_x * axes_y).sum(-1), (axes_y * axes_y).sum(-1)
     cov2d = torch.stack([xx + BLUR_PX2, xy, yy + BLUR_PX2], -1)
     # Of the blurred product B B^T + b I of a 2x3 matrix with rows r1, r2: |r1 x r2|^2 + b (|r1|^2 + |r2|^2) + b^2.
-    det = torch.linalg.cross(spread_x, spread_y).square().sum(-1) + BLUR_PX2 * (xx + yy) + BLUR_PX2**2
-    per_px = _local_per_px(cov2d, det, torch.stack([spread_x[:, :2], spread_y[:, :2]], 1))
+    det = torch.linalg.cross(axes_x, axes_y).square().sum(-1) + BLUR_PX2 * (xx + yy) + BLUR_PX2**2
+    per_px = _local_per_px(cov2d, det, torch.stack([axes_x[:, :2], axes_y[:, :2]], 1))
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
     towards = splats.means - torch.as_tensor(camera.center, dtype=splats.means.dtype, device=splats.means.device)
     return means2d, cov2d, det, z, sh.colors(splats.sh, unit(towards)), per_px @ color_slopes(splats)
 
 
-def _local_per_px(cov2d: Tensor, det: Tensor, spread: Tensor) -> Tensor:
+def _local_per_px(cov2d: Tensor, det: Tensor, axes2d: Tensor) -> Tensor:
     """(N, 2, 2) change of the first two local coordinates, in standard deviations, per px along x, then y.
 
-    A Gaussian at local coordinates q ~ N(0, I) projects to B q plus the blur, with B = `spread` for the first two axes.
+    A Gaussian at local coordinates q ~ N(0, I) projects to B q plus the blur, with B = `axes2d` for the first two axes.
     Of what is seen at offset d from its center the mean of q is B^T cov2d^-1 d: that is where on it the pixel lies.
     """
     xx, xy, yy = cov2d.unbind(-1)
     inverse = torch.stack([torch.stack([yy, -xy], -1), torch.stack([-xy, xx], -1)], 1) / det[:, None, None]
-    return inverse @ spread
+    return inverse @ axes2d
 
 
 def color_slopes(splats: Splats) -> Tensor:

@@ -40,7 +40,7 @@ CONFIG, LOG, CHECKPOINT, SCENE = "config.json", "log.jsonl", "checkpoint.safeten
 CHECKPOINT_SECONDS = 60.0
 """Longest time of work that a crash can cost, besides the iteration in progress, unless told otherwise."""
 CHECKPOINT_SHARE = 0.05  # share of the time that writing checkpoints may take: large states are written less often
-FORMAT = "endoprior-checkpoint-1"
+CHECKPOINT_FORMAT = "endoprior-checkpoint-1"
 RESTART = "Train again without --resume."
 
 
@@ -175,7 +175,7 @@ def _iterations_done(checkpoint: Path, cfg: Config) -> int:
     if not checkpoint.is_file():
         return 0
     with rejecting(checkpoint, "a training state", RESTART):
-        about = load_facts(checkpoint, FORMAT, RESTART)
+        about = load_facts(checkpoint, CHECKPOINT_FORMAT, RESTART)
         return int(about["iteration"]) + (cfg.schedule.coarse_iterations if Stage(about["stage"]) is Stage.FINE else 0)
 
 
@@ -293,7 +293,7 @@ def save_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
     trainer.sequence.demand_unchanged(fingerprint)
     state = trainer.state
     about = {"stage": int(state.stage), "iteration": state.iteration, "config": to_dict(trainer.cfg)}
-    save_arrays(path, state.arrays(), about | {"fingerprint": fingerprint}, FORMAT)
+    save_arrays(path, state.arrays(), about | {"fingerprint": fingerprint}, CHECKPOINT_FORMAT)
 
 
 def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str, *, any_length: bool = False) -> None:
@@ -309,7 +309,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str, *, any_lengt
         reject_other_run(path, *stored, cfg, fingerprint, sequence.path, any_length=any_length)
         return trainer.schema()
 
-    arrays, about = load_arrays(path, {FORMAT: schema}, next_step)
+    arrays, about = load_arrays(path, {CHECKPOINT_FORMAT: schema}, next_step)
     with rejecting(path, "a training state", next_step):
         stage, iteration = Stage(about["stage"]), about["iteration"]
         length = stage_length(cfg, stage)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from ..core.checks import input_error
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..footage.carry_masks import sampled
 from ..footage.components import AREA, Mask, components, regions_where
@@ -46,7 +46,7 @@ def free_clicked(
 
 def _steps(sequence: FrameSequence, clicks: Sequence[ToolClick], tool: Callable[[int], Mask]) -> Iterator[SearchStep]:
     count, done = len(sequence), 0
-    view = view_of([sequence.frame(i) for i in spread(count, SAMPLES)])
+    view = view_of([sequence.frame(i) for i in evenly_spaced(count, SAMPLES)])
     for click in clicks:
         labels, _ = components(tool(click.frame) & view)
         clicked = (labels == labels[int(click.y), int(click.x)]) & (labels > 0)

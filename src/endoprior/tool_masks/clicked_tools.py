@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..footage.components import Mask, large_regions
 from .examples import Examples, clicked_region, examples_of, feature_map, fit
@@ -92,7 +92,7 @@ def _steps(
     sequence: FrameSequence, clicks: Sequence[ToolClick], tool: Callable[[int], Mask], finder: ToolFinder
 ) -> Iterator[SearchStep]:
     count = len(sequence)
-    view = view_of([sequence.frame(i) for i in spread(count, SAMPLES)])
+    view = view_of([sequence.frame(i) for i in evenly_spaced(count, SAMPLES)])
     small = small_view(view)
 
     def look(index: int) -> tuple[NDArray[np.float32], Mask]:
@@ -101,7 +101,7 @@ def _steps(
         known = cv2.resize(known, small.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
         return feature_map(finder.log_odds(rgb_u8, view), network_image(rgb_u8, view)), known
 
-    taught = sorted({*spread(count, TAUGHT), *(click.frame for click in clicks)})
+    taught = sorted({*evenly_spaced(count, TAUGHT), *(click.frame for click in clicks)})
     total, regions, examples = len(taught) + count, dict[int, Mask](), list[Examples]()
     for done, i in enumerate(taught, 1):
         features, known = look(i)

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.ranges import spread
-from ..footage.components import Mask, components, disk, grown
+from ..core.ranges import evenly_spaced
+from ..footage.components import Mask, components, dilated, disk
 
 SURE = 4.0  # Log-odds count up to this, so that examples can outweigh a network that is sure and wrong
 COLORS = 5  # Channels of the network's image: color, two color ratios
@@ -114,14 +114,14 @@ def examples_of(features: NDArray[np.float32], view: Mask, tool: Mask, clicked: 
     """The examples of one frame: `view` (h, w) is True inside the endoscope's image, `tool` on tools that are masked
     already, `clicked` on the regions of clicks; all False in most frames.
     """
-    near = grown(tool | clicked, disk(GAP_PX))
+    near = dilated(tool | clicked, disk(GAP_PX))
     some_clicked, total = clicked.any(), max(float(clicked.sum()), 1.0)
     parts = (
         (clicked, int(total), True, min(CLICKED_WEIGHT, CLICKED_MOST / total)),
         (tool & ~clicked & view, TOOL, True, TOOL_WEIGHT),
         (view & ~near, TISSUE_IN_CLICKED if some_clicked else TISSUE, False, 1.0),
     )
-    rows = [features[where][spread(int(where.sum()), most)] for where, most, _, _ in parts]
+    rows = [features[where][evenly_spaced(int(where.sum()), most)] for where, most, _, _ in parts]
     counts = [len(row) for row in rows]
     return Examples(
         np.concatenate(rows),

@@ -33,7 +33,7 @@ SHA256 = "354f24d519af9bd2c7d48540de993a97c7b66a17e932575d7cdd99939c1d1cde"
 """Of the file; a test compares it with the file and with the model card."""
 LONG_SIDE_PX = 192  # Longer side of the images: a shaft is 15 px wide, a jaw 3
 INPUTS = 6  # Channels of the image: color, two color ratios, the view
-DARK = 0.04
+LOG_COLOR_OFFSET = 0.04
 """Added to each channel, in [0, 1], before the logarithm: about the noise of dark pixels, which have no color."""
 MATTE = (0.1, 0.85)
 """A pixel whose largest channel is above the first and whose smallest is below the second shows a surface's color."""
@@ -145,7 +145,7 @@ def network_input(rgb_u8: Image, view: Mask) -> NDArray[np.float32]:
     """
     color = rgb_u8.astype(np.float32) / np.float32(255)
     matte = view & (color.max(-1) > MATTE[0]) & (color.min(-1) < MATTE[1])
-    logs = np.log(color + np.float32(DARK))
+    logs = np.log(color + np.float32(LOG_COLOR_OFFSET))
     ratios = logs[..., (0, 2)] - logs[..., 1:2]
     usual = np.median(ratios[matte], 0) if matte.any() else np.zeros(2, np.float32)
     ratios = np.clip(ratios - usual, -2, 2)
@@ -230,7 +230,7 @@ class ToolFinder:
             return Look(np.asarray(shrunk, np.uint8), self.log_odds(rgb_u8, view))
 
         for tools in decide_over_time(each(look, images), small):
-            yield FoundTools(tools.mask, _confidence(tools.mask, tools.log_odds, small))
+            yield FoundTools(tools.tool_mask, _confidence(tools.tool_mask, tools.log_odds, small))
 
 
 def _confidence(mask: Mask, log_odds: NDArray[np.float32], view: Mask) -> float:

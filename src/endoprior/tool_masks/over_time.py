@@ -22,7 +22,7 @@ from .regions import candidate_regions, joined
 
 KEEP = 0.85  # Weight of the frame before: half a second of video at 25 frames/s
 MOST_LOG_ODDS = 6.0  # One sure frame does not outweigh all others
-COLOR_LEVELS, RETURN_PX = 15.0, 1.5
+COLOR_SCALE_LEVELS, ROUND_TRIP_SCALE_PX = 15.0, 1.5
 """Differences of color, of 255, and of flow there and back, px, at which a place counts e times less."""
 COLOR_BLUR_PX = 1.0
 CHUNK, MARGIN = 120, 24  # Frames that are decided at once, and that are known beside them: KEEP^24 is 2 %
@@ -43,7 +43,7 @@ class Look:
 class SmallTools:
     """The tools of one frame at the network's size."""
 
-    mask: Mask  # (h, w)
+    tool_mask: Mask  # (h, w)
     log_odds: Values  # (h, w) carried over time
 
 
@@ -61,7 +61,7 @@ def decide_over_time(looks: Iterable[Look], view: Mask) -> Iterator[SmallTools]:
 
 
 def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
-    links = [Link.between(before, after) for before, after in pairwise(looks)]
+    links = [BidirectionalFlow.between(before, after) for before, after in pairwise(looks)]
     odds = carried([np.clip(look.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS) for look in looks], links)
     regions = [candidate_regions(each, view) for each in odds]
     taken = [np.any([np.zeros_like(view), *(r.mask for r in found if r.is_tool)], axis=0) for found in regions]
@@ -73,7 +73,7 @@ def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
 
 
 @dataclass(frozen=True)
-class Link:
+class BidirectionalFlow:
     """Where the pixels of two neighboring frames are in each other, and how far that can be believed."""
 
     to_before: NDArray[np.float32]  # (h, w, 2) places in the frame before of the pixels of the frame after, px
@@ -82,7 +82,7 @@ class Link:
     trust_before: Values
 
     @classmethod
-    def between(cls, before: Look, after: Look) -> Link:
+    def between(cls, before: Look, after: Look) -> BidirectionalFlow:
         shape = before.log_odds.shape
         grid = np.dstack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1])))
         onward = back = np.zeros_like(grid)
@@ -92,15 +92,15 @@ class Link:
         colors = [cv2.GaussianBlur(each.rgb_u8.astype(np.float32), (0, 0), COLOR_BLUR_PX) for each in (before, after)]
 
         def trust(here: NDArray, there: NDArray, flow: NDArray, way_back: NDArray) -> Values:
-            color = np.abs(sampled(there, grid + flow) - here).mean(-1) / COLOR_LEVELS
-            returns = np.linalg.norm(flow + sampled(way_back, grid + flow), axis=-1) / RETURN_PX
+            color = np.abs(sampled(there, grid + flow) - here).mean(-1) / COLOR_SCALE_LEVELS
+            returns = np.linalg.norm(flow + sampled(way_back, grid + flow), axis=-1) / ROUND_TRIP_SCALE_PX
             return np.exp(-(color**2) - returns**2).astype(np.float32)
 
         ahead, behind = trust(colors[0], colors[1], onward, back), trust(colors[1], colors[0], back, onward)
         return cls(grid + back, grid + onward, behind, ahead)
 
 
-def carried(values: list[Values], links: list[Link], least_trust: float = 0.0) -> list[Values]:
+def carried(values: list[Values], links: list[BidirectionalFlow], least_trust: float = 0.0) -> list[Values]:
     """(h, w) weighted mean of each frame's values and those of the frames around, carried along the flow."""
 
     def step(places: NDArray[np.float32], trust: Values) -> tuple[NDArray[np.float32], Values]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.components import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, components, disk, grown, regions_where
+from ..footage.components import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, components, dilated, disk, regions_where
 
 LEVELS = np.arange(-0.6, 4.01, 0.5)  # of the log-odds, at which regions may end: probabilities from 0.35 to 0.98
 STABLE = 0.8  # Share of a region that the next level leaves of one with an outline
@@ -23,7 +23,7 @@ needle, the head of an instrument whose shaft is hidden."""
 REACH = 0.75
 """A tool enters end first: it must reach into the view by this share of the length of its contact with the border.
 At 0.5 an organ along the border passes; at 1 a thick shaft that has just entered fails."""
-LEAST_SHARE = 0.002  # Smaller regions, as a share of the view, are removed: about 25 px square at 640x512
+MIN_TOOL_REGION_SHARE = 0.002  # Smaller regions, as a share of the view, are removed: about 25 px square at 640x512
 LARGEST_HOLE = 0.01  # Holes up to this share of the view are filled: highlights, and the windows of a grasper's jaws
 RIM_PX = 2  # Pixels this near to a tool belong to it from the first level on
 OUTSIDE = -8.0  # Log-odds beyond the view
@@ -45,7 +45,7 @@ def tool_regions(log_odds: NDArray[np.float32], view: Mask) -> Mask:
 
 def candidate_regions(log_odds: NDArray[np.float32], view: Mask) -> list[Region]:
     """All regions with an outline; arguments as in `tool_regions`. In one that is no tool, smaller ones may be."""
-    smooth, least, most = _smooth(log_odds, view), LEAST_SHARE * view.sum(), LARGEST_HOLE * view.sum()
+    smooth, least, most = _smooth(log_odds, view), MIN_TOOL_REGION_SHARE * view.sum(), LARGEST_HOLE * view.sum()
     probability = 1 / (1 + np.exp(-smooth))
 
     def regions(mask: Mask, level: int) -> list[Region]:
@@ -75,7 +75,7 @@ def candidate_regions(log_odds: NDArray[np.float32], view: Mask) -> list[Region]
 def joined(masks: list[Mask], log_odds: NDArray[np.float32], view: Mask) -> Mask:
     """(h, w) the union of regions, with their rims."""
     union = np.any([np.zeros_like(view), *masks], axis=0)
-    rim = (_smooth(log_odds, view) > LEVELS[0]) & grown(union, disk(RIM_PX))
+    rim = (_smooth(log_odds, view) > LEVELS[0]) & dilated(union, disk(RIM_PX))
     return filled(union | rim, LARGEST_HOLE * view.sum()) & view
 
 
@@ -96,7 +96,7 @@ def entering_regions(mask: NDArray, view: Mask) -> Mask:
         box = np.s_[y : y + height, x : x + width]
         region = labels[box] == i
         contact = region & (inward[box] <= 3)
-        if i == 0 or area < LEAST_SHARE * view.sum() or not contact.any():
+        if i == 0 or area < MIN_TOOL_REGION_SHARE * view.sum() or not contact.any():
             continue
         # A tool that crosses the view touches the border twice; use the longer contact.
         pieces = components(contact)[1][1:]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..data.found_tools import FoundTools
@@ -30,17 +30,17 @@ def find_in_sequence(
     and the tools of the frame. `refine` only adds pixels to the sequence's masks, in regions that touch them.
     """
     total, finder = len(sequence), ToolFinder()
-    view = view_of([sequence.frame(i) for i in spread(total, SAMPLES)])
+    view = view_of([sequence.frame(i) for i in evenly_spaced(total, SAMPLES)])
     images = (sequence.frame(i).rgb_u8 for i in range(total))
     for i, small in enumerate(finder.find_over_time(images, view)):
-        frame, found = sequence.frame(i), replace(small, mask=full_size(small.mask, view.shape) & view)
+        frame, found = sequence.frame(i), replace(small, tool_mask=full_size(small.tool_mask, view.shape) & view)
         if refine:
             given = ~frame.tissue_mask & view
-            labels, boxes = components(given | found.mask)
+            labels, boxes = components(given | found.tool_mask)
             touches = np.isin(np.arange(len(boxes)), labels[given])
             found = FoundTools(regions_where(touches, labels), found.confidence)
         progress("finding tools", i + 1, total)
-        yield found.mask | ~view, found
+        yield found.tool_mask | ~view, found
 
 
 def view_of(frames: Sequence[Frame]) -> Mask:

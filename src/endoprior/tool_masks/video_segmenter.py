@@ -17,7 +17,7 @@ import numpy as np
 
 from ..data import FrameSequence
 from ..data.found_tools import FoundTools
-from ..footage.components import AREA, Image, Mask, components, disk, grown
+from ..footage.components import AREA, Image, Mask, components, dilated, disk
 from .mask_store import MaskStore, read_state, write_state
 from .sequence import Progress, find_in_sequence, no_progress
 
@@ -31,7 +31,7 @@ STRETCH = 50
 """At most one frame is prompted in each stretch of so many frames: a tool that enters later is found there."""
 RIM_SHARE = 1 / 320
 """Width of the rim that found tools have around them, as a share of the image width: 2 px of 640."""
-LEAST_SHARE = 0.002  # Smaller regions, as a share of the image, prompt nothing
+MIN_PROMPT_REGION_SHARE = 0.002  # Smaller regions, as a share of the image, prompt nothing
 MOST_REGIONS = 6  # Of one frame, the largest first. Each is an object of its own, which takes memory and time
 COVERED = 0.1  # A region with at least this share inside masks that were carried before is not new
 
@@ -105,8 +105,8 @@ class _Clip:
             return
         confidence = []
         for i, (mask, found) in enumerate(find_in_sequence(self.sequence, refine=refine, progress=progress)):
-            self.found.put(i, found.mask)
-            self.outside.add(0, mask & ~found.mask)  # the border of the view, one for the clip
+            self.found.put(i, found.tool_mask)
+            self.outside.add(0, mask & ~found.tool_mask)  # the border of the view, one for the clip
             confidence.append(float(found.confidence))
         self._note(confidence=confidence)
 
@@ -179,23 +179,23 @@ def rim_px(width: int) -> int:
     return max(1, round(width * RIM_SHARE))
 
 
-def sure_regions(mask: Mask, covered: Mask | None = None) -> list[Mask]:
+def sure_regions(tool_mask: Mask, covered: Mask | None = None) -> list[Mask]:
     """The connected regions of a tool mask (H, W) without its rim, the largest first, at most `MOST_REGIONS`; without
     those that lie in `covered`, tools that are known already.
     """
     # The image's edge is not an edge of the tool: nothing is taken off there.
-    labels, boxes = components(cv2.erode(mask.astype(np.uint8), disk(rim_px(mask.shape[1]))) > 0)
+    labels, boxes = components(cv2.erode(tool_mask.astype(np.uint8), disk(rim_px(tool_mask.shape[1]))) > 0)
     areas = boxes[:, AREA]
     order = sorted(range(1, len(areas)), key=lambda i: (-areas[i], i))
-    large = [labels == i for i in order if areas[i] >= LEAST_SHARE * mask.size]
+    large = [labels == i for i in order if areas[i] >= MIN_PROMPT_REGION_SHARE * tool_mask.size]
     if covered is not None:
         large = [region for region in large if covered[region].mean() < COVERED]
     return large[:MOST_REGIONS]
 
 
-def with_rim(mask: Mask) -> Mask:
+def with_rim(tool_mask: Mask) -> Mask:
     """(H, W) a carried mask with the rim that `sure_regions` takes off: color of a tool bleeds over its edge."""
-    return grown(mask, disk(rim_px(mask.shape[1])))
+    return dilated(tool_mask, disk(rim_px(tool_mask.shape[1])))
 
 
 def carry(

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..core.ranges import spread
+from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..system.memory import BoundedCache, cache_bytes
 from ..tool_masks import ToolFinder
@@ -41,7 +41,7 @@ HIGHLIGHT = (0.5, 0.7)
 SURELY_TISSUE = -3.0  # log-odds of a tool below which a pixel always counts
 SAMPLES = 12  # frames from which the border of the view is taken
 VISITS = 4  # number of visits that are kept of each frame: early ones show what the scene had not learned yet
-LEAST_SHARE = 0.005  # share of the view above which a visit speaks for a missed tool: about 40 px square at 640x512
+MIN_MISSED_TOOL_SHARE = 0.005  # share of the view from which on a visit speaks for one: about 40 px square at 640x512
 LEAST_VISITS = 2  # so many of the last visits must; a single one may be a highlight
 
 
@@ -85,7 +85,7 @@ class MaskDoubt:
 
     def __init__(self, sequence: FrameSequence) -> None:
         indices = sequence.indices("train")
-        frames = [sequence.frame(indices[k]) for k in spread(len(indices), SAMPLES)]
+        frames = [sequence.frame(indices[k]) for k in evenly_spaced(len(indices), SAMPLES)]
         self._sequence, self._view = sequence, view_of(frames)
         self._finder = ToolFinder()
         height, width = self._view.shape
@@ -135,5 +135,5 @@ def record_visit(shares: Tensor, position: int, share: float) -> None:
 
 def missed_tool_frames(shares: Tensor, indices: Sequence[int]) -> tuple[int, ...]:
     """Those of the training frames `indices` whose masks likely miss a tool, by their `shares` (F, VISITS)."""
-    often = (shares > LEAST_SHARE).sum(1) >= LEAST_VISITS
+    often = (shares > MIN_MISSED_TOOL_SHARE).sum(1) >= LEAST_VISITS
     return tuple(index for index, missed in zip(indices, often.tolist(), strict=True) if missed)

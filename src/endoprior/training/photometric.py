@@ -32,7 +32,7 @@ LEAST_GAIN, MOST_GAIN = 0.02, 16.0
 FOLLOW = 0.15  # share by which a frame changes the running mean of the tissue
 BRIGHT = 0.95  # color from which a pixel does not count: the sensor is saturated
 CLEAR = 0.01  # mean veil up to which a frame counts as clear, about: the gains of clear frames average to 1
-WINDOW_PX, DARK = 17, 0.01  # neighborhood whose contrast is measured; light below which contrast is noise
+WINDOW_PX, CONTRAST_OFFSET = 17, 0.01  # neighborhood whose contrast is measured; light below which contrast is noise
 HAZY_GRAY, HAZY_LOSS = 0.06, 0.45
 """Rise of gray, and loss of contrast, from the clearest frame on, which together only smoke explains."""
 
@@ -83,7 +83,7 @@ def looks_of(frames: Sequence[Small]) -> Looks:
             cv2.blur(values, (WINDOW_PX, WINDOW_PX)) for values in (weight, weight * light, weight * light**2)
         )
         mean, second = mean / (share + 1e-6), second / (share + 1e-6)
-        ratio = np.sqrt(np.maximum(second - mean**2, 0)) / (mean + DARK)
+        ratio = np.sqrt(np.maximum(second - mean**2, 0)) / (mean + CONTRAST_OFFSET)
         contrast.append(float((weight * ratio).sum() / max(weight.sum(), 1e-6)))
         lowest, highest = (float((values * weight).sum()) for values in (square.min(-1), square.max(-1)))
         gray.append(np.sqrt(lowest / max(highest, 1e-6)))

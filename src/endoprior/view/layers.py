@@ -33,11 +33,11 @@ def with_tool(picture: NDArray[np.uint8], original: NDArray[np.uint8], tool: NDA
     return _outlined(np.where(tool[..., None], original, picture), tool)
 
 
-def with_mask(picture: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A copy of an image with a mask (H, W) in a transparent color, outlined."""
+def with_mask(picture: NDArray[np.uint8], tool_mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A copy of an image with a tool mask (H, W) in a transparent color, outlined."""
     picture = picture.copy()
-    picture[mask] = (1 - MASK_SHARE) * picture[mask] + MASK_SHARE * np.array(OUTLINE)
-    return _outlined(picture, mask)
+    picture[tool_mask] = (1 - MASK_SHARE) * picture[tool_mask] + MASK_SHARE * np.array(OUTLINE)
+    return _outlined(picture, tool_mask)
 
 
 def _outlined(picture: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

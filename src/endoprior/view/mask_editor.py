@@ -133,22 +133,22 @@ class MaskEdits:
         return frames
 
 
-def stroke(mask: Mask, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> Mask:
-    """A copy of a mask with a brush stroke.
+def stroke(tool_mask: Mask, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> Mask:
+    """A copy of a tool mask with a brush stroke.
 
     Args:
         points: (x, y) through which the center of the brush moves, px; (0, 0) is the upper left corner of the image.
         radius: of the brush, px; at least one pixel is changed.
         paint: True adds pixels, False removes them.
     """
-    drawn = np.zeros(mask.shape, np.uint8)
+    drawn = np.zeros(tool_mask.shape, np.uint8)
     # Sixteenths of a pixel; OpenCV counts pixel centers from 0. Positions far outside would overflow.
-    limit = 4 * max(mask.shape)
+    limit = 4 * max(tool_mask.shape)
     fixed = np.rint(16 * (np.clip(points, -limit, limit) - 0.5)).astype(np.int32)
     cv2.polylines(drawn, [fixed], False, 1, max(round(2 * radius), 1), cv2.LINE_8, 4)
     for point in fixed.tolist():
         cv2.circle(drawn, point, round(16 * radius), 1, -1, cv2.LINE_8, 4)
-    return mask | (drawn > 0) if paint else mask & (drawn == 0)
+    return tool_mask | (drawn > 0) if paint else tool_mask & (drawn == 0)
 
 
 SPHERE_MM = 5000.0

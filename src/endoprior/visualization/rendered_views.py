@@ -19,19 +19,19 @@ from ..system.atomic import whole_file
 from .image_tools import colorize, label, tile, to_u8, write_png
 from .video import write_video
 
-View = tuple[float, Camera]
+TimedCamera = tuple[float, Camera]
 
 SWAY_SHARE = 0.12
 """Amplitude of the swaying camera, as a share of the distance to the tissue."""
 
 
-def times_path(times: list[float], cameras: tuple[Camera, ...]) -> list[View]:
+def times_path(times: list[float], cameras: tuple[Camera, ...]) -> list[TimedCamera]:
     """The camera of the sequence at each of `times` in [0, 1]."""
     last = len(cameras) - 1
     return [(time, cameras[min(round(time * len(cameras)), last)]) for time in times]
 
 
-def sway_path(times: list[float], cameras: tuple[Camera, ...], distance_mm: float) -> list[View]:
+def sway_path(times: list[float], cameras: tuple[Camera, ...], distance_mm: float) -> list[TimedCamera]:
     """The camera of the sequence, moved on a small circle, pointing at the point `distance_mm` straight ahead."""
     views = []
     for k, (time, camera) in enumerate(times_path(times, cameras)):
@@ -65,7 +65,7 @@ def _looking(camera: Camera, position: NDArray, distance: float) -> Camera:
     return replace(camera, world_to_camera=matrix @ camera.world_to_camera)
 
 
-def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
+def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[TimedCamera]:
     """Read a camera path: a JSON list of {"time": t in [0, 1], "world_to_camera": 4 x 4, mm, OpenCV axes}.
 
     A view without a matrix uses the camera of the sequence at that time. Intrinsics are those of the sequence.
@@ -84,7 +84,7 @@ def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
     return views
 
 
-def _view(entry: dict, cameras: tuple[Camera, ...]) -> View:
+def _view(entry: dict, cameras: tuple[Camera, ...]) -> TimedCamera:
     time = float(entry["time"])
     if not 0 <= time <= 1:
         raise ValueError(f"time {time} is not in [0, 1]")
@@ -107,7 +107,7 @@ AT_A_TIME = 8
 
 def write_views(
     scene: RenderedScene,
-    views: list[View],
+    views: list[TimedCamera],
     out: Path,
     video: Path,
     frames: Sequence[Frame] | None = None,

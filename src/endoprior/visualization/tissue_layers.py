@@ -23,7 +23,7 @@ from ..model.scene import Scene
 from ..model.surface import FramesOf, Support, project_visible, render_surface
 from ..system.atomic import whole_file
 from .image_tools import SOLID_ALPHA, label, to_u8
-from .rendered_views import View, file_stem, write_film
+from .rendered_views import TimedCamera, file_stem, write_film
 
 SQUARES, STRIPES = 40, 80
 """Squares of the grid and stripes of the hatching along the width of the image: 16 px and 8 px of 640."""
@@ -145,7 +145,7 @@ def _marked(
 
 
 def write_texture_film(
-    scene: Scene, views: list[View], out: Path, video: Path, frames: Sequence[Frame] | None = None
+    scene: Scene, views: list[TimedCamera], out: Path, video: Path, frames: Sequence[Frame] | None = None
 ) -> None:
     """Write a grid, painted on the first frame, as it is carried to each view; see `write_film`."""
     painted = PaintedTissue(scene)
@@ -155,7 +155,7 @@ def write_texture_film(
 
 def write_support_film(
     support: SupportMap,
-    views: list[View],
+    views: list[TimedCamera],
     out: Path,
     video: Path,
     frames_per_second: float,

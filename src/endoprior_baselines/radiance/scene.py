@@ -13,7 +13,7 @@ from endoprior.core.config import Config
 from endoprior.core.types import Camera, RenderedView
 from endoprior.model.scene import RenderedScene
 from endoprior.model.scene_facts import camera_arrays, scene_facts
-from endoprior.model.single_scene import FORMAT
+from endoprior.model.single_scene import SCENE_FORMAT
 from endoprior.render import Backend
 from endoprior.system.arrays_file import save_arrays
 
@@ -76,4 +76,4 @@ class RadianceScene(RenderedScene):
     def save(self, path: Path) -> None:
         arrays = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         arrays |= camera_arrays(self.cameras)
-        save_arrays(path, arrays, scene_facts(self), FORMAT)
+        save_arrays(path, arrays, scene_facts(self), SCENE_FORMAT)

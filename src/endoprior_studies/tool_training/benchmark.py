@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from endoprior.core.ranges import spread
+from endoprior.core.ranges import evenly_spaced
 from endoprior.tool_masks import ToolFinder
 from endoprior.tool_masks.regions import disk
 
@@ -81,12 +81,12 @@ def score_set(finder: ToolFinder, frames: Iterable[TestFrame]) -> SetScore:
     """Find the tools of each frame, and compare."""
     total, seen = Counts(), []
     for frame in frames:
-        found = finder.find(frame.rgb_u8, frame.view).mask
+        found = finder.find(frame.rgb_u8, frame.view).tool_mask
         counts = count(found, frame)
         total += counts
         seen.append((counts.core_missed + counts.false, frame, found))
     order = sorted(range(len(seen)), key=lambda k: seen[k][0])
-    return SetScore(total, tuple(seen[order[k]][1:] for k in spread(len(order), SHOWN)))
+    return SetScore(total, tuple(seen[order[k]][1:] for k in evenly_spaced(len(order), SHOWN)))
 
 
 def count(found: NDArray[np.bool_], frame: TestFrame) -> Counts:

@@ -49,7 +49,7 @@ class LabeledFrame:
 
 Frames = Sequence[Sequence[LabeledFrame]]
 """The real frames of each set that may be used."""
-Scene = tuple[Field, NDArray[np.uint8]]
+LabeledImage = tuple[Field, NDArray[np.uint8]]
 """(h, w, 3) colors and (h, w) labels."""
 
 
@@ -123,7 +123,7 @@ def any_frame(rng: Generator, frames: Frames) -> LabeledFrame:
     return chosen[int(rng.integers(len(chosen)))]
 
 
-def _cropped(rng: Generator, frame: LabeledFrame) -> Scene:
+def _cropped(rng: Generator, frame: LabeledFrame) -> LabeledImage:
     height, width = frame.label.shape
     turned = rng.random() < 0.3
     aspect = (SIZE[0] / SIZE[1]) ** (-1 if turned else 1) * log_uniform(rng, 0.8, 1.25)
@@ -143,7 +143,7 @@ def _cropped(rng: Generator, frame: LabeledFrame) -> Scene:
     return image.astype(np.float32) / 255, np.asarray(label, np.uint8)
 
 
-def _transferred(rng: Generator, scene: Field, label: NDArray[np.uint8], frames: Frames) -> Scene:
+def _transferred(rng: Generator, scene: Field, label: NDArray[np.uint8], frames: Frames) -> LabeledImage:
     """Tools of a real frame cut out and put over the scene, in another light."""
     image, tools = _cropped(rng, any_frame(rng, frames))
     if not (tools == 1).any():
@@ -159,7 +159,7 @@ def _transferred(rng: Generator, scene: Field, label: NDArray[np.uint8], frames:
 
 def _placed(
     rng: Generator, scene: Field, label: NDArray[np.uint8], canvas: Canvas, blurred: bool = True, near: bool = False
-) -> Scene:
+) -> LabeledImage:
     """The painted body over the scene: behind tissue in places, with its shadow, blurred by focus and motion."""
     covered, outline, color = canvas.covered, canvas.outline, canvas.color
     if rng.random() < 0.12:  # tissue in front of a part of it

@@ -31,7 +31,7 @@ LONG_SIDE_PX = 420
 """Training frames are held at this size: parts of them become examples of 256 px."""
 TOOL_FREE = range(97, 148)
 """Frames of `mono_endo` without a tool."""
-DARK, DARK_PX = 25, 25
+ROUND_BORDER_LEVEL, MIN_ROUND_BORDER_PX = 25, 25
 """Largest level and least width of what is black around a round image."""
 EYE_PX = 81
 """Size of the square around each pixel of a tool in which `cataract1k` tells what is none, px."""
@@ -102,8 +102,8 @@ def _without_tools(path: Path, wanted: range) -> Iterator[Labeled]:
         for i, picture in enumerate(container.decode(video=0)):
             if i in wanted:
                 image = np.asarray(picture.to_ndarray(format="rgb24"), np.uint8)
-                kernel = np.ones((DARK_PX, DARK_PX), np.uint8)
-                dark = cv2.morphologyEx((image.max(-1) < DARK).astype(np.uint8), cv2.MORPH_OPEN, kernel)
+                kernel = np.ones((MIN_ROUND_BORDER_PX, MIN_ROUND_BORDER_PX), np.uint8)
+                dark = cv2.morphologyEx((image.max(-1) < ROUND_BORDER_LEVEL).astype(np.uint8), cv2.MORPH_OPEN, kernel)
                 yield f"{path.stem} {i}", image, np.where(dark > 0, IGNORED, 0).astype(np.uint8)
 
 
@@ -154,12 +154,12 @@ def phantom_sets() -> dict[str, tuple[PhantomConfig, ...]]:
 
 def phantom_frames(folder: Path, phantoms: tuple[PhantomConfig, ...]) -> Iterator[TestFrame]:
     """The frames of some phantoms; written to `folder` once."""
-    for config in phantoms:
-        place = folder / f"{config.instruments}_{config.tissue}"
+    for cfg in phantoms:
+        place = folder / f"{cfg.instruments}_{cfg.tissue}"
         if not place.exists():
-            write_phantom(place, config)
-        for i in range(config.frames):
+            write_phantom(place, cfg)
+        for i in range(cfg.frames):
             tools = read_tool_mask(place / "masks" / f"{i:06d}.png")
             whole = np.ones_like(tools)
             image = read_color(place / "images" / f"{i:06d}.png")
-            yield TestFrame(f"{config.instruments} on {config.tissue} {i}", image, whole, tools, whole)
+            yield TestFrame(f"{cfg.instruments} on {cfg.tissue} {i}", image, whole, tools, whole)

@@ -1,10 +1,10 @@
 """How close rendered color is to the true one: PSNR and SSIM, as the published protocol defines them.
 
-Shared letters: `H, W` image size. `image` and `target` are (H, W, 3) rendered and true color in [0, 1]; `mask` is
-(H, W) True = tissue, the pixel counts. A frame without tissue scores NaN. Sums are in float64. The protocol measures
-8-bit images: round rendered color with `context.to_uint8` first. ValueError is raised where shapes differ, the mask is
-not bool, or an image is not finite floating point. Sources: the evaluation of EndoGaussian and EndoPrior-GS
-(docs/paper_map.md), Wang et al. 2004 for SSIM.
+Shared letters: `H, W` image size. `image` and `target` are (H, W, 3) rendered and true color in [0, 1];
+`scored_mask` is (H, W) True = the pixel counts: the tissue, or a part of the image. A frame without any scores NaN.
+Sums are in float64. The protocol measures 8-bit images: round rendered color with `context.to_uint8` first. ValueError
+is raised where shapes differ, the mask is not bool, or an image is not finite floating point. Sources: the evaluation
+of EndoGaussian and EndoPrior-GS (docs/paper_map.md), Wang et al. 2004 for SSIM.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...footage.components import Mask
 from ..score import Score, ScoreUnavailable
 
@@ -82,7 +82,7 @@ def compute(context: EvaluationContext) -> None:
             raise ScoreUnavailable("the split is that of training")
         context.reject_slow_frames()
         trained = context.sequence.frames("train")
-        chosen = [trained[k] for k in spread(len(trained), TRAINING_FRAMES)]
+        chosen = [trained[k] for k in evenly_spaced(len(trained), TRAINING_FRAMES)]
         values = [psnr_tissue(context.rendered[f.index].rgb, f.rgb, f.tissue_mask) for f in chosen]
         context.add_mean("psnr_train", values, "no tissue in training frames")
     with context.skip_if_unavailable("seam_psnr"):
@@ -106,11 +106,11 @@ class SquaredErrors:
     of_frame: int  # Number of values of the whole frame: 3 for each pixel
 
 
-def squared_errors(image: NDArray, target: NDArray, mask: Mask) -> SquaredErrors:
+def squared_errors(image: NDArray, target: NDArray, scored_mask: Mask) -> SquaredErrors:
     """What a frame adds to `pooled_psnr`."""
-    check_images(image, target, mask)
-    total = float(np.sum((image[mask].astype(np.float64) - target[mask].astype(np.float64)) ** 2))
-    return SquaredErrors(total, 3 * int(mask.sum()), image.size)
+    check_images(image, target, scored_mask)
+    total = float(np.sum((image[scored_mask].astype(np.float64) - target[scored_mask].astype(np.float64)) ** 2))
+    return SquaredErrors(total, 3 * int(scored_mask.sum()), image.size)
 
 
 def pooled_psnr(frames: Sequence[SquaredErrors], *, over_frame: bool) -> float:
@@ -124,45 +124,45 @@ def pooled_psnr(frames: Sequence[SquaredErrors], *, over_frame: bool) -> float:
     return float(-10 * np.log10(total / count)) if total > 0 else float("inf")
 
 
-def psnr(image: NDArray, target: NDArray, mask: Mask) -> float:
+def psnr(image: NDArray, target: NDArray, scored_mask: Mask) -> float:
     """PSNR of the masked images over the whole frame, dB: the published one."""
-    return pooled_psnr([squared_errors(image, target, mask)], over_frame=True)
+    return pooled_psnr([squared_errors(image, target, scored_mask)], over_frame=True)
 
 
-def psnr_tissue(image: NDArray, target: NDArray, mask: Mask) -> float:
+def psnr_tissue(image: NDArray, target: NDArray, scored_mask: Mask) -> float:
     """PSNR over the tissue pixels alone, dB."""
-    return pooled_psnr([squared_errors(image, target, mask)], over_frame=False)
+    return pooled_psnr([squared_errors(image, target, scored_mask)], over_frame=False)
 
 
-def ssim(image: NDArray, target: NDArray, mask: Mask) -> float:
+def ssim(image: NDArray, target: NDArray, scored_mask: Mask) -> float:
     """Structural similarity of the masked images, averaged over all pixels and channels, in [-1, 1].
 
     Gaussian window of 11 px and sigma 1.5 px, zeros outside the frame, C1 = 0.01^2, C2 = 0.03^2. Windows that lie
     entirely outside the mask score 1, as in the published protocol.
     """
-    return _mean(_ssim_map(image, target, mask), mask)
+    return _mean(_ssim_map(image, target, scored_mask), scored_mask)
 
 
-def ssim_tissue(image: NDArray, target: NDArray, mask: Mask) -> float:
+def ssim_tissue(image: NDArray, target: NDArray, scored_mask: Mask) -> float:
     """`ssim` averaged over the tissue pixels alone; within windows at their border the others are black."""
-    return _mean(_ssim_map(image, target, mask)[mask], mask)
+    return _mean(_ssim_map(image, target, scored_mask)[scored_mask], scored_mask)
 
 
-def ssim_valid(image: NDArray, target: NDArray, mask: Mask) -> float:
+def ssim_valid(image: NDArray, target: NDArray, scored_mask: Mask) -> float:
     """`ssim` over the windows that lie completely inside the frame; NaN for a frame smaller than the window."""
     border = SSIM_WINDOW // 2
-    return _mean(_ssim_map(image, target, mask)[border:-border, border:-border], mask)
+    return _mean(_ssim_map(image, target, scored_mask)[border:-border, border:-border], scored_mask)
 
 
-def _mean(values: NDArray[np.float64], mask: Mask) -> float:
-    return float(values.mean()) if mask.any() and values.size else float("nan")
+def _mean(values: NDArray[np.float64], scored_mask: Mask) -> float:
+    return float(values.mean()) if scored_mask.any() and values.size else float("nan")
 
 
-def _ssim_map(image: NDArray, target: NDArray, mask: Mask) -> NDArray[np.float64]:
+def _ssim_map(image: NDArray, target: NDArray, scored_mask: Mask) -> NDArray[np.float64]:
     """(H, W, 3) structural similarity of the masked images."""
-    check_images(image, target, mask)
-    a = np.where(mask[..., None], image, 0).astype(np.float64)
-    b = np.where(mask[..., None], target, 0).astype(np.float64)
+    check_images(image, target, scored_mask)
+    a = np.where(scored_mask[..., None], image, 0).astype(np.float64)
+    b = np.where(scored_mask[..., None], target, 0).astype(np.float64)
     mean_a, mean_b = _window_mean(a), _window_mean(b)
     variance_a = _window_mean(a * a) - mean_a * mean_a
     variance_b = _window_mean(b * b) - mean_b * mean_b
@@ -181,18 +181,19 @@ def _window_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(mean, np.float64)
 
 
-def check_images(image: NDArray, target: NDArray, mask: Mask) -> None:
+def check_images(image: NDArray, target: NDArray, scored_mask: Mask) -> None:
     """Raise ValueError unless the three arrays fit together and both images are finite floating point."""
-    check_shape("image:H,W,3 target:H,W,3 mask:H,W", image=image, target=target, mask=checked_mask(mask))
+    counted = checked_mask(scored_mask)
+    check_shape("image:H,W,3 target:H,W,3 scored_mask:H,W", image=image, target=target, scored_mask=counted)
     check_finite_float("image", image)
     check_finite_float("target", target)
 
 
-def checked_mask(mask: Mask) -> Mask:
-    """The mask itself, or ValueError: `~mask` and `array[mask]` mean something else for integers."""
-    if mask.dtype != np.bool_:
-        raise ValueError(f"mask must be bool, True = score the pixel; got {mask.dtype}")
-    return mask
+def checked_mask(scored_mask: Mask) -> Mask:
+    """The mask itself, or ValueError: `~` and indexing mean something else for integers."""
+    if scored_mask.dtype != np.bool_:
+        raise ValueError(f"scored_mask must be bool, True = score the pixel; got {scored_mask.dtype}")
+    return scored_mask
 
 
 def check_finite_float(name: str, values: NDArray) -> None:

@@ -88,20 +88,22 @@ class LpipsDistance:
     lowest: Literal[-1, 0] = -1
     """Value of black in what the network sees; white is 1. The network is calibrated for -1."""
 
-    def __call__(self, image: NDArray, target: NDArray, mask: Mask) -> float:
+    def __call__(self, image: NDArray, target: NDArray, scored_mask: Mask) -> float:
         """LPIPS of the masked images scaled to [lowest, 1], averaged over the frame; NaN for an empty mask.
         ScoreUnavailable where a side is shorter than `MIN_SIZE`.
         """
         import torch
 
-        check_images(image, target, mask)
-        height, width = mask.shape
+        check_images(image, target, scored_mask)
+        height, width = scored_mask.shape
         if min(height, width) < MIN_SIZE:
             raise ScoreUnavailable(f"LPIPS needs images of at least {MIN_SIZE} px a side; got {width}x{height}")
-        if not mask.any():
+        if not scored_mask.any():
             return float("nan")
         scale = np.float32(1 - self.lowest)
-        scaled = (np.where(mask[..., None], x, 0).astype(np.float32) * scale + self.lowest for x in (image, target))
+        scaled = (
+            np.where(scored_mask[..., None], x, 0).astype(np.float32) * scale + self.lowest for x in (image, target)
+        )
         a, b = (torch.from_numpy(x).permute(2, 0, 1)[None] for x in scaled)
         with torch.inference_mode():
             return float(self.network(a, b))

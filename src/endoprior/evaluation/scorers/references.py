@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.geometry import back_project, project
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...core.types import Camera, Frame
 from ...data import FrameList, FrameSequence
 from ...footage.alignment import align
 from ...footage.components import Mask
-from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, follow_both_ways, gray_for_flow, stuck
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, follow_both_ways, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
@@ -59,11 +59,10 @@ MEAN_FRAMES = 60  # training frames in the mean image
 STARTS, AHEAD, GRID = 6, 12, 16
 """Frames from which points are followed, for so many frames, and the number of points along the wider side."""
 HALF = np.float32(0.5)  # OpenCV counts pixels from the center of the first one, we from its edge
-RETURN_PX = 1.0  # a point that comes back by less is followed rightly
 REFERENCE_WIDTH_PX = 640
 LEAST_ANGLE = math.radians(1.5)  # rays that meet at a smaller angle do not tell depth
 MOST_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, are not of one resting point
-LEAST_POINTS, LEAST_SHARE = 40, 0.1
+MIN_TRACKED_POINTS, MIN_TRACKED_SHARE = 40, 0.1
 """Least number of points that a score rests on, and their share of all that lie on tissue: a few beside a dark tube do
 not speak for its depth."""
 RELIEF_POINTS, LEAST_RELIEF = 100, 0.03
@@ -98,7 +97,7 @@ def _image_references(context: EvaluationContext) -> None:
 
 def mean_image(frames: FrameList) -> NDArray[np.float32]:
     """(H, W, 3) mean color in [0, 1] of up to `MEAN_FRAMES` frames over their tissue; of all pixels where none is."""
-    chosen = [frames[k] for k in spread(len(frames), MEAN_FRAMES)]
+    chosen = [frames[k] for k in evenly_spaced(len(frames), MEAN_FRAMES)]
     weight, tissue, every = np.zeros_like(chosen[0].rgb[..., :1]), *np.zeros((2, *chosen[0].rgb.shape), np.float32)
     for frame in chosen:
         mask = frame.tissue_mask[..., None]
@@ -136,7 +135,7 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
     sequence = context.sequence
     ahead = min(AHEAD, len(sequence) - 1)
     slips, errors, reliefs, tried = list[NDArray](), list[NDArray](), list[NDArray](), 0
-    starts = spread(len(sequence) - ahead, STARTS)
+    starts = evenly_spaced(len(sequence) - ahead, STARTS)
     with frame_threads(BYTES_PER_PX * sequence.frame(0).tissue_mask.size) as pool:
         paths = list(pool.map(lambda k: follow(sequence, k, ahead), starts))
     for k, followed in zip(starts, paths, strict=True):
@@ -164,9 +163,9 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
         ("depth_triangulated_error", errors, f"{STANDS}, or {FEW_POINTS}"),
     ):
         found = np.concatenate(values) if values else np.zeros(0)
-        enough = len(found) >= max(LEAST_POINTS, LEAST_SHARE * tried)
+        enough = len(found) >= max(MIN_TRACKED_POINTS, MIN_TRACKED_SHARE * tried)
         context.add(name, float(np.median(found)) if enough else math.nan, why)
-    relief = relief_agreement(np.concatenate(reliefs, 1) if reliefs else np.zeros((2, 0)), LEAST_SHARE * tried)
+    relief = relief_agreement(np.concatenate(reliefs, 1) if reliefs else np.zeros((2, 0)), MIN_TRACKED_SHARE * tried)
     context.add("depth_relief", relief, f"{STANDS}, the tissue is flat, or {FEW_POINTS}")
 
 
@@ -205,10 +204,10 @@ def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
     for index in range(first + 1, first + ahead + 1):
         before, frame = frame, sequence.frame(index)
         following = gray_for_flow(frame.rgb_u8, 1)
-        there, returned = follow_both_ways(gray, following, now, RETURN_PX)
+        there, returned = follow_both_ways(gray, following, now)
         step = align(gray, following, before.tissue_mask, frame.tissue_mask)
         if step is not None:
-            returned &= ~stuck(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)
+            returned &= ~fixed_in_image(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)
         kept &= returned & shown_pixels(there + HALF, frame.tissue_mask)
         gray, now = following, there
     return Followed(start[kept] + HALF, now[kept] + HALF, tried)

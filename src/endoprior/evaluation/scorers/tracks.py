@@ -37,7 +37,7 @@ THRESHOLDS_PX = (4, 8, 16, 32, 64)
 """Distances within which a point counts as followed, px of the frame: those of STIR 2024."""
 NEIGHBORS = 4  # Nearest neighbors of each point whose connection is checked
 TEAR_STRETCH = 2.0  # A connection between neighbors that is this many times too long is torn
-RETURN_PX, RETURN_SHARE = 1.0, 0.05
+CHAIN_ROUND_TRIP_PX, CHAIN_ROUND_TRIP_SHARE = 1.0, 0.05
 """Chained flow loses a point where flow and backward flow disagree by more than this, plus this share of the step."""
 FLOW_BYTES = 40  # Memory per pixel while the flow of a pair of frames is computed, bytes
 FLOW_CHUNK = 16  # Number of frame pairs whose flow is computed together
@@ -384,7 +384,7 @@ def chained_flow(starts: NDArray[np.floating], first: NDArray[np.intp], sequence
         step = _flow_at(there, pixels[k], frame)
         pixels[k + 1] = np.where(moving[:, None], pixels[k] + step, pixels[k])
         gap = np.linalg.norm(step + _flow_at(back, pixels[k + 1], frame), axis=-1)
-        returns = gap <= RETURN_PX + RETURN_SHARE * np.linalg.norm(step, axis=-1)
+        returns = gap <= CHAIN_ROUND_TRIP_PX + CHAIN_ROUND_TRIP_SHARE * np.linalg.norm(step, axis=-1)
         shown = shown_pixels(pixels[k + 1], frame.tissue_mask)
         x, y = cells_at(pixels[k + 1], frame.camera.width, frame.camera.height)
         depth = np.where(moving & shown & frame.depth_valid[y, x], frame.depth[y, x], depth)

@@ -318,5 +318,5 @@ def refined_pose(
     # The residuals themselves say how large the errors are: the tracker's vary from clip to clip.
     variance = float((weight[:, 0] * squared).sum() / max(2 * weight[:, 0].sum() - 6, 1))
     covariance = np.linalg.inv(normal + 1e-9 * np.eye(6)) * variance
-    spread = np.sqrt(np.maximum([np.trace(covariance[3:, 3:]), np.trace(covariance[:3, :3])], 0))
-    return Resected(pose, squared < SINGLE_WIDTH**2, float(spread[0]), float(spread[1]))
+    std = np.sqrt(np.maximum([np.trace(covariance[3:, 3:]), np.trace(covariance[:3, :3])], 0))
+    return Resected(pose, squared < SINGLE_WIDTH**2, float(std[0]), float(std[1]))

@@ -33,7 +33,7 @@ DEFORMING = 0.1  # tracks below this weight deform; the tissue around them is ma
 AROUND = 40  # ... within the image width divided by this
 SECONDS_AN_IMAGE = 1.0  # about the time on two cores. Mapping that alone takes longer is stopped: see `time_note`.
 LEAST_SECONDS = 60  # mapping may always take this long
-LEAST_SHARE = 0.3  # a model with a smaller share of the frames is no path of the clip
+MIN_REGISTERED_SHARE = 0.3  # a model with a smaller share of the frames is no path of the clip
 PARALLAX = 0.02  # least spread of the rays to a point, rad, whose position counts for the scale
 FEWEST = 10  # with fewer such points in a frame, its scale is that of the frames around
 STRIDE = 3  # points are placed by every third frame and all keyframes: neighbors add nothing
@@ -75,7 +75,7 @@ def colmap_path(
             save_png(folder / f"masks/{i:06d}.png.png", _allowed(seen, follower, i).astype(np.uint8) * 255)
         models, notes = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
     best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    if best is None or best.num_reg_images() < max(LEAST_SHARE * len(range(0, count, stride)), 3):
+    if best is None or best.num_reg_images() < max(MIN_REGISTERED_SHARE * len(range(0, count, stride)), 3):
         return None
     poses, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
     for image in best.images.values():

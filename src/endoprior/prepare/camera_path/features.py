@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...footage.alignment import align
-from ...footage.optical_flow import follow_both_ways, stuck
+from ...footage.optical_flow import fixed_in_image, follow_both_ways
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
-from .tracks import Lens, PoseInput
+from .tracks import PoseInput, TrackingCamera
 
 MAX_CORNERS = 500
 REFRESH = 0.8  # new corners are detected when fewer than this share of `MAX_CORNERS` is left
@@ -32,7 +32,6 @@ COARSE_FLAT_WIDTHS, BLUR_WIDTHS = 28, 160
 """Where corners are few, detail between blurs of width / 160 and width / 28 px is followed: finer patterns of sensor or
 fibers stay where they are while the view moves."""
 GUESS_PX = 10.0  # parallax: a corner is this far from where the image as a whole goes, px of an image 640 px wide
-RETURN_PX = 1.0  # followed to the next frame and back, a corner returns within this distance
 KEYPOINTS = 600
 RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
 FEWEST_INLIERS = 20  # fewer matches that one pose explains may be chance
@@ -40,7 +39,7 @@ INLIER_PX = 4.0  # reprojection error of a match, px of an image 640 px wide: th
 
 
 @dataclass(frozen=True)
-class View:
+class TrackingFrame:
     """A frame as points are recognized in it."""
 
     plain: NDArray[np.uint8]  # (H, W) brightness: finds large motion
@@ -49,7 +48,7 @@ class View:
     depth: NDArray[np.float32]  # (H, W) 0 where missing
 
 
-def view_of(seen: PoseInput, *, coarse: bool = False) -> View:
+def tracking_frame(seen: PoseInput, *, coarse: bool = False) -> TrackingFrame:
     """Prepare a frame. Args: coarse: whether corners are few, so that larger detail is followed."""
     plain = np.asarray(cv2.cvtColor(seen.rgb_u8, cv2.COLOR_RGB2GRAY), np.uint8)
     width, usual = plain.shape[1], float(np.median(plain))
@@ -65,7 +64,9 @@ def view_of(seen: PoseInput, *, coarse: bool = False) -> View:
     bright = (bright - _smooth(bright, tissue, sigma, 0.0)) * tissue
     flat = np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8)
     measured = np.isfinite(seen.depth) & (seen.depth > 0)
-    return View(plain, flat, usable_tissue(seen) & (tissue > 0.5), np.where(measured, seen.depth, np.float32(0)))
+    return TrackingFrame(
+        plain, flat, usable_tissue(seen) & (tissue > 0.5), np.where(measured, seen.depth, np.float32(0))
+    )
 
 
 def _smooth(image: NDArray, weight: NDArray[np.float32], sigma: float, far: float) -> NDArray[np.float32]:
@@ -85,7 +86,7 @@ def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
     return (inner & (1 - glint)).astype(bool)
 
 
-def new_corners(view: View, taken: NDArray[np.float32]) -> NDArray:
+def new_corners(view: TrackingFrame, taken: NDArray[np.float32]) -> NDArray:
     """(N, 2) corners on smooth tissue with depth, away from those `taken` (M, 2); none if these are enough."""
     if len(taken) >= REFRESH * MAX_CORNERS:
         return np.zeros((0, 2), np.float32)
@@ -114,20 +115,20 @@ def _cells(pixels: NDArray, width: int, height: int) -> NDArray[np.intp]:
     return np.clip((pixels[:, 1] * CELLS[1] / height).astype(int), 0, CELLS[1] - 1) * CELLS[0] + column
 
 
-def followed(before: View, now: View, pixels: NDArray) -> tuple[NDArray, NDArray]:
+def followed(before: TrackingFrame, now: TrackingFrame, pixels: NDArray) -> tuple[NDArray, NDArray]:
     """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
-    near, good = follow_both_ways(before.plain, now.plain, pixels, RETURN_PX, halvings=COARSE_HALVINGS)
+    near, good = follow_both_ways(before.plain, now.plain, pixels, halvings=COARSE_HALVINGS)
     there, still_good = follow_both_ways(
-        before.flat, now.flat, pixels, RETURN_PX, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
+        before.flat, now.flat, pixels, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
     )
     good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
     return kept, there[kept]
 
 
-def followed_directly(before: View, now: View, pixels: NDArray) -> tuple[NDArray, NDArray] | None:
+def followed_directly(before: TrackingFrame, now: TrackingFrame, pixels: NDArray) -> tuple[NDArray, NDArray] | None:
     """As `followed`, each corner from where the image as a whole goes; None if the two images do not say where."""
     step = align(before.plain, now.plain, before.usable, now.usable)
     if step is None:
@@ -139,14 +140,13 @@ def followed_directly(before: View, now: View, pixels: NDArray) -> tuple[NDArray
         before.flat,
         now.flat,
         pixels,
-        RETURN_PX,
         side_px=31,
         halvings=FINE_HALVINGS,
         guess=guess,
         criteria=FINE_CRITERIA,
     )
     px = now.flat.shape[1] / 640
-    good &= ~stuck(there - pixels, guess - pixels, now.flat.shape[1])
+    good &= ~fixed_in_image(there - pixels, guess - pixels, now.flat.shape[1])
     good &= (np.linalg.norm(there - guess, axis=1) < GUESS_PX * px) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
     return kept, there[kept]
@@ -173,7 +173,7 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
-class Link:
+class KeyframeMatch:
     """A keyframe recognized in another one."""
 
     pose: NDArray  # (4, 4) world-to-camera of the new one, in the world of the old one
@@ -182,7 +182,7 @@ class Link:
     scale: float  # depth in the world of the old one, as a multiple of the new one's own depth
 
 
-def keyframe(index: int, view: View) -> Keyframe:
+def keyframe(index: int, view: TrackingFrame) -> Keyframe:
     """Describe a frame by its SIFT keypoints on tissue with depth."""
     mask = (view.usable & (view.depth > 0)).astype(np.uint8)
     found, descriptors = cv2.SIFT.create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(view.plain, mask)
@@ -195,7 +195,9 @@ def keyframe(index: int, view: View) -> Keyframe:
     return Keyframe(index, pixels[kept], depths[kept], descriptors[kept].astype(np.uint8), no_track)
 
 
-def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe) -> Link | None:
+def match_keyframe(
+    lens: TrackingCamera, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe
+) -> KeyframeMatch | None:
     """Find the pose of `new` from what it shares with `old`; None if that is too little."""
     first, second = _matches(old.descriptors.astype(np.float32), new.descriptors.astype(np.float32))
     if len(first) < FEWEST_INLIERS:
@@ -209,7 +211,7 @@ def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Ke
     scale = float(np.median(z / new.depths[second[inlier]]))
     if not scale > 0:
         return None
-    return Link(pose, first[inlier], second[inlier], scale)
+    return KeyframeMatch(pose, first[inlier], second[inlier], scale)
 
 
 def _matches(a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:

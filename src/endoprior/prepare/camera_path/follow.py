@@ -11,11 +11,22 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...system.parallel import frame_threads
 from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
-from .features import Keyframe, Link, View, followed, followed_directly, keyframe, link, new_corners, sampled, view_of
-from .tracks import Lens, PoseInput, Tracks
+from .features import (
+    Keyframe,
+    KeyframeMatch,
+    TrackingFrame,
+    followed,
+    followed_directly,
+    keyframe,
+    match_keyframe,
+    new_corners,
+    sampled,
+    tracking_frame,
+)
+from .tracks import PoseInput, TrackingCamera, Tracks
 
 BYTES_PER_PX = 60  # memory in which a thread prepares a frame, bytes for each px of a square one
 MIN_TRACKS = 30  # with fewer tracks a frame gets no pose from the frame before
@@ -31,7 +42,7 @@ RECENT, OLDER = 6, 14  # keyframes that a lost frame is compared with: the last 
 class Follower:
     """What is known about the path so far."""
 
-    def __init__(self, lens: Lens, count: int, *, few_corners: bool = False) -> None:
+    def __init__(self, lens: TrackingCamera, count: int, *, few_corners: bool = False) -> None:
         """Args: lens: the camera. count: frames of the clip. few_corners: whether images are aligned directly first."""
         self.few_corners, self.lens, self.tracks = few_corners, lens, Tracks(lens)
         self.poses = np.tile(np.eye(4), (count, 1, 1))  # (T, 4, 4) world-to-camera, in the world of the frame's segment
@@ -39,10 +50,10 @@ class Follower:
         self.segment = np.full(count, -1)
         self.keyframes: list[Keyframe] = []
         self._ids, self._pixels = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
-        self._view: View | None = None
+        self._view: TrackingFrame | None = None
         self._at_keyframe = self._ids, self._pixels
 
-    def follow(self, index: int, view: View) -> None:
+    def follow(self, index: int, view: TrackingFrame) -> None:
         """Add the next frame."""
         before, lost = self._view, True
         depths, follow = np.zeros(0, np.float32), followed_directly if self.few_corners else followed
@@ -63,7 +74,7 @@ class Follower:
             self._at_keyframe = self._ids, self._pixels
 
     def _find_pose(
-        self, index: int, last_view: View, ids: NDArray, before: NDArray, pixels: NDArray, depths: NDArray
+        self, index: int, last_view: TrackingFrame, ids: NDArray, before: NDArray, pixels: NDArray, depths: NDArray
     ) -> bool:
         """Set pose and scale of a frame from its tracks; False if nothing rigid explains them."""
         tracks, lens = self.tracks, self.lens
@@ -130,15 +141,17 @@ class Follower:
         new = keyframe(index, self._view)
         others = [old for old in self.keyframes if self.segment[old.frame] != self.segment[index]]
         self.keyframes.append(new)
-        tried = [*others[-RECENT:], *(others[i] for i in spread(max(len(others) - RECENT, 0), OLDER))]
-        links = [(link(self.lens, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried]
+        tried = [*others[-RECENT:], *(others[i] for i in evenly_spaced(max(len(others) - RECENT, 0), OLDER))]
+        links = [
+            (match_keyframe(self.lens, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried
+        ]
         if found := [(each, old) for each, old in links if each is not None]:
             best, old = max(found, key=lambda pair: len(pair[0].old))
             self._move_segment(index, best, int(self.segment[old.frame]))
         self._adjust_last()
 
-    def _move_segment(self, index: int, found: Link, target: int) -> None:
-        """Move the segment of a frame into the world in which the frame has the pose of the link."""
+    def _move_segment(self, index: int, found: KeyframeMatch, target: int) -> None:
+        """Move the segment of a frame into the world in which the frame has the pose of the match."""
         frames = np.flatnonzero(self.segment == self.segment[index])
         factor = found.scale / self.scales[index] if self.lens.depth_is_relative else 1.0
         back, old = np.linalg.inv(found.pose), self.poses[index].copy()
@@ -170,7 +183,7 @@ class Follower:
         for frame in frames:
             self.set_scale(frame, np.ones(len(tracks.weight), bool))
 
-    def _refill(self, index: int, view: View) -> None:
+    def _refill(self, index: int, view: TrackingFrame) -> None:
         """Detect new corners where tracks died; their points come from depth."""
         pixels = new_corners(view, self._pixels)
         depths = sampled(view.depth, pixels).astype(np.float32)
@@ -182,13 +195,13 @@ class Follower:
 
 
 def follow_camera(
-    frame: Callable[[int], PoseInput], count: int, lens: Lens, progress: Callable[[int], None] = lambda _done: None,
-    *, few_corners: bool = False,
+    frame: Callable[[int], PoseInput], count: int, lens: TrackingCamera,
+    progress: Callable[[int], None] = lambda _done: None, *, few_corners: bool = False,
 ) -> Follower:  # fmt: skip
     """Follow the camera through frames 0..count-1, each read once, in order."""
     follower = Follower(lens, count, few_corners=few_corners)
     with frame_threads(BYTES_PER_PX * lens.width**2) as pool:
-        for index, view in enumerate(pool.map(lambda i: view_of(frame(i), coarse=few_corners), range(count))):
+        for index, view in enumerate(pool.map(lambda i: tracking_frame(frame(i), coarse=few_corners), range(count))):
             follower.follow(index, view)
             progress(index + 1)
     return follower

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from .adjust import back_projected
 from .path_facts import PathMotion
-from .tracks import CameraPath, Lens, Tracks
+from .tracks import CameraPath, TrackingCamera, Tracks
 
 GAP = 5  # frames between two poses that are compared: jitter of single frames is smaller than motion over them
 
 
-def path_motion(path: CameraPath, tracks: Tracks, lens: Lens, size: tuple[int, int]) -> PathMotion:
+def path_motion(path: CameraPath, tracks: Tracks, lens: TrackingCamera, size: tuple[int, int]) -> PathMotion:
     """Measure a path. Args: tracks: whose depths were used. lens: with the focal length of the path. size: px."""
     count, poses = len(path.explained), np.linalg.inv(path.camera_to_world)
     depth = np.array([np.median(z[z > 0]) if (z > 0).any() else np.nan for z in tracks.depths]) * path.depth_scale

@@ -87,8 +87,8 @@ def match_frames(
 
 def _picture(seen: PoseInput, size: tuple[int, int]) -> _Picture:
     view = EvenView.of(seen.rgb_u8, seen.tissue_mask, size)
-    spread = float(view.detail[view.usable > 0].std()) if view.usable.any() else 1.0
-    levels = np.clip(128 + 128 / (CONTRAST * max(spread, 1e-6)) * view.detail, 0, 255).astype(np.uint8)
+    std = float(view.detail[view.usable > 0].std()) if view.usable.any() else 1.0
+    levels = np.clip(128 + 128 / (CONTRAST * max(std, 1e-6)) * view.detail, 0, 255).astype(np.uint8)
     depth = cv2.resize(seen.depth, size, interpolation=cv2.INTER_NEAREST)
     inner = cv2.erode((view.usable * (depth > 0)).astype(np.uint8) * 255, np.ones((2 * INNER_PX + 1,) * 2, np.uint8))
     return _Picture(levels, np.asarray(inner, np.uint8), np.asarray(depth, np.float32))

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ...data.description import OWN_POSES
 from .adjust import adjust, back_projected
 from .breathing import Breathing, separate_breathing
-from .features import Keyframe, link
+from .features import Keyframe, match_keyframe
 from .follow import Follower, follow_camera
-from .tracks import CameraPath, Lens, PoseInput, Tracks
+from .tracks import CameraPath, PoseInput, TrackingCamera, Tracks
 
 FOCAL_PRIOR = 0.2  # standard deviation of log f where the focal length is assumed
 FOCAL_STD = 0.03  # a refined focal length is kept if the standard deviation of its logarithm is below this
@@ -37,7 +37,7 @@ FEWEST_TRACKS = 20
 def own_path(
     frame: Callable[[int], PoseInput],
     count: int,
-    lens: Lens,
+    lens: TrackingCamera,
     size: tuple[int, int],
     *,
     refine_focal: bool = False,
@@ -163,7 +163,7 @@ def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, 
                 partners.append(int(a))
         for a in partners:
             old = keyframes[a]
-            match = link(lens, old, poses[old.frame], scales[old.frame], new)
+            match = match_keyframe(lens, old, poses[old.frame], scales[old.frame], new)
             if match is None:
                 continue
             fresh = old.track[match.old] < 0

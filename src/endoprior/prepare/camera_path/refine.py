@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .adjust import Adjusted, Observations, adjust, back_projected, residuals
 from .even_view import matrix_at
 from .matches import Matches, match_frames
-from .tracks import CameraPath, Lens, PoseInput
+from .tracks import CameraPath, PoseInput, TrackingCamera
 
 LARGEST_WIDTH = 640  # frames are matched at this width at most, px
 PIXEL_STD = 0.3  # of a match, px of an image 640 px wide
@@ -41,7 +41,12 @@ class Refined:
 
 
 def refined_path(
-    path: CameraPath, frame: Callable[[int], PoseInput], lens: Lens, size: tuple[int, int], *, refine_focal: bool
+    path: CameraPath,
+    frame: Callable[[int], PoseInput],
+    lens: TrackingCamera,
+    size: tuple[int, int],
+    *,
+    refine_focal: bool,
 ) -> Refined | None:
     """Adjust a path to direct matches; None where too few frames have parallax.
 

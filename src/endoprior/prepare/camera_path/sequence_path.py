@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error, number_ranges
 from ...core.geometry import Convention, length_unit, to_ours
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...core.shell import install_command
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import SHOWN, CameraMotion
 from ...footage.known_facts import KnownFacts
-from ...footage.pose_fit import View, measure_poses
+from ...footage.pose_fit import RgbdFrame, measure_poses
 from ...system.parallel import frame_threads
 from .adjust import Observations, adjust, back_projected, residuals
 from .colmap import LONGEST, colmap_path, is_installed, with_poses
@@ -31,7 +31,7 @@ from .own import own_path
 from .pose_file import MM_PER_M, is_model, is_text, read_model_poses, read_poses, read_text_poses
 from .refine import refined_path
 from .shape import DepthShape, axial_cosine, fitted_shape
-from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
+from .tracks import DEPTH_STD, CameraPath, PoseInput, TrackingCamera, Tracks
 from .tube import shape_by_light
 
 BYTES_PER_PX = 60  # memory in which a thread compares two frames, bytes for each px
@@ -92,7 +92,7 @@ def sequence_path(
     frame: Frame,
     views: Callable[[], tuple[Iterable[NDArray[np.uint8]], Iterable[NDArray[np.bool_]]]],
     count: int,
-    lens: Lens,
+    lens: TrackingCamera,
     size: tuple[int, int],
     *,
     has_depth: bool,
@@ -166,7 +166,13 @@ def _unknown_path(motion: CameraMotion, why: str) -> tuple[CameraPath, list[str]
 
 
 def _given_path(
-    how: str, frame: Frame, count: int, lens: Lens, has_depth: bool, reading: Reading, progress: Callable[[int], None]
+    how: str,
+    frame: Frame,
+    count: int,
+    lens: TrackingCamera,
+    has_depth: bool,
+    reading: Reading,
+    progress: Callable[[int], None],
 ) -> tuple[CameraPath, list[str]]:
     known, notes = np.ones(count, bool), list(reading.notes)
     if is_model(Path(how)):
@@ -196,7 +202,7 @@ def _given_path(
 def find_path(
     frame: Frame,
     count: int,
-    lens: Lens,
+    lens: TrackingCamera,
     size: tuple[int, int],
     how: How = "best",
     *,
@@ -264,7 +270,7 @@ def _deeper(
     shape = fitted_shape(path, follower, cosine) if path.motion and path.motion.drives else None
     if shape is None:
         posed = np.flatnonzero(path.explained)
-        shape = shape_by_light((frame(int(posed[i])) for i in spread(len(posed), LIT_FRAMES)), cosine)
+        shape = shape_by_light((frame(int(posed[i])) for i in evenly_spaced(len(posed), LIT_FRAMES)), cosine)
     if shape is None:
         return path, follower
     new, tracks = path, follower
@@ -277,7 +283,7 @@ def _deeper(
 
 
 def _refined(
-    path: CameraPath, tracks: Tracks, frame: Frame, lens: Lens, size: tuple[int, int], *, refine_focal: bool
+    path: CameraPath, tracks: Tracks, frame: Frame, lens: TrackingCamera, size: tuple[int, int], *, refine_focal: bool
 ) -> CameraPath:
     """The path adjusted to direct matches if they fit and still explain the held-out tracks; else as it is."""
 
@@ -299,7 +305,7 @@ def _refined(
     return replace(found.path, motion=motion, notes=[*path.notes, note])
 
 
-def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
+def explained_share(tracks: Tracks, lens: TrackingCamera, path: CameraPath) -> float:
     """Mean over all frames of the mean score of their held-out observations, 0..1: tracks of no estimate.
 
     Each of these tracks is triangulated from every second of its observations, and compared with the others. A frame
@@ -352,10 +358,10 @@ def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
     return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
 
-def _fit_notes(how: str, stored: NDArray, frame: Frame, lens: Lens, reading: Reading) -> list[str]:
+def _fit_notes(how: str, stored: NDArray, frame: Frame, lens: TrackingCamera, reading: Reading) -> list[str]:
     """A note if the images say that the poses are to be read in another way."""
 
-    def view(index: int) -> View:
+    def view(index: int) -> RgbdFrame:
         seen = frame(index)
         return seen.rgb_u8, seen.tissue_mask, np.nan_to_num(seen.depth)
 
@@ -371,7 +377,7 @@ def _fit_notes(how: str, stored: NDArray, frame: Frame, lens: Lens, reading: Rea
     return []
 
 
-def _estimate_notes(reason: str, path: CameraPath, lens: Lens) -> list[str]:
+def _estimate_notes(reason: str, path: CameraPath, lens: TrackingCamera) -> list[str]:
     """How far the path reaches and how sure it is, where the camera rests, and the focal length if it was refined."""
     unit, centers = length_unit(lens.depth_is_relative), path.camera_to_world[:, :3, 3]
     reach = np.linalg.norm(centers - centers[0], axis=1).max()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .follow import Follower
 from .path_facts import DepthShape
-from .tracks import CameraPath, Lens
+from .tracks import CameraPath, TrackingCamera
 
 PARALLAX_DEGREES = 2.0  # rays to a point differ by this, or its depth is that of the shading
 FEWEST = 200  # observations of such points
@@ -24,7 +24,7 @@ LEAST_POWER, MOST_POWER = 1.15, 6.0
 CLEAR = 0.3  # share of the variance of log depth that the power explains
 
 
-def axial_cosine(lens: Lens, size: tuple[int, int]) -> NDArray[np.float32]:
+def axial_cosine(lens: TrackingCamera, size: tuple[int, int]) -> NDArray[np.float32]:
     """(H, W) cosine of the angle between the rays of the pixels and the axis. Args: size: (W, H), px."""
     x, y = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in size))
     k = lens.matrix

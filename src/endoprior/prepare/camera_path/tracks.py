@@ -31,7 +31,7 @@ class PoseInput:
 
 
 @dataclass(frozen=True)
-class Lens:
+class TrackingCamera:
     """A pinhole camera whose depth was measured; pixel centers are counted from 0, as in OpenCV."""
 
     matrix: NDArray  # (3, 3) K, px
@@ -42,14 +42,14 @@ class Lens:
     @classmethod
     def centered_at_half(
         cls, matrix: NDArray, width: int, depth_is_relative: bool, baseline_mm: float | None = None
-    ) -> Lens:
+    ) -> TrackingCamera:
         """From K with the left-most pixel centered at 0.5."""
         opencv = np.array(matrix, np.float64)
         opencv[:2, 2] -= 0.5
         return cls(opencv, width, depth_is_relative, baseline_mm)
 
-    def with_focal(self, factor: float) -> Lens:
-        """The lens with both focal lengths multiplied."""
+    def with_focal(self, factor: float) -> TrackingCamera:
+        """The camera with both focal lengths multiplied."""
         matrix = self.matrix.copy()
         matrix[[0, 1], [0, 1]] *= factor
         return replace(self, matrix=matrix)
@@ -116,7 +116,7 @@ class CameraPath:
 class Tracks:
     """Observations by frame, and the points they belong to."""
 
-    def __init__(self, lens: Lens) -> None:
+    def __init__(self, lens: TrackingCamera) -> None:
         self.lens = lens
         self.ids: list[NDArray[np.int32]] = []
         self.pixels: list[NDArray[np.float32]] = []

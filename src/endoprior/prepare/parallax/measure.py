@@ -23,7 +23,7 @@ from .consistency import checked
 from .filling import bent, steady
 from .sweep import FINE_WIDTH, Shot, Sweep, scaled_size
 
-LEAST_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
+MIN_MEASURED_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
 LEAST_FRAMES = 0.5  # share of the frames that have partners, below which the camera moves too little
 BYTES_PER_PX = 400  # memory in which a thread measures a frame, bytes for each px of a fine view
 AROUND = 4  # frames on each side with which the depth of a frame is averaged
@@ -52,7 +52,7 @@ class ParallaxDepth:
         """Why it is no answer; empty if it is one."""
         if self.frames < LEAST_FRAMES:
             return f"the camera moves too little beside {1 - self.frames:.0%} of the frames"
-        if self.share < LEAST_SHARE:
+        if self.share < MIN_MEASURED_SHARE:
             return f"parallax and path agree on {self.share:.0%} of the tissue"
         return ""
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import input_error
-from ...core.ranges import spread
+from ...core.ranges import evenly_spaced
 from ...data.known_length import parse_known_length, scale_by_lengths
 from ...data.scale import Scale, demand_plausible
 from ...footage.border import find_outline, masked_border
@@ -65,7 +65,7 @@ def scale_by_shafts(frame: Frame, count: int, matrix: NDArray[np.float64], shaft
     Raises:
         InputError: no tool in the masks, or no shaft that is straight and long enough.
     """
-    samples = [frame(i) for i in spread(count, SAMPLES)]
+    samples = [frame(i) for i in evenly_spaced(count, SAMPLES)]
     images = [seen.rgb_u8 for seen in samples]
     outside = masked_border(find_outline(images), images, (seen.tissue_mask for seen in samples))
     readings, with_tools = [], 0

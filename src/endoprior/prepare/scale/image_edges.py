@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 INWARD_PX, OUTWARD_PX = 14.0, 4.0  # how far from the line of the mask to look, at a width of 640 px
 SAMPLE_PX = 0.5  # between samples across the edge
 BLUR_PX = 1.5
-DARK = 8
+COLOR_SHARE_OFFSET = 8  # added to each channel, of 255: the colors of dark pixels are noise
 NEAR_PX = 1.5  # of edge points around their line
 STRONG = 80.0  # percentile of the changes around a line that counts as much as any stronger change
-LEAST_SHARE = 0.5  # of the places along an edge that must change near the line
+MIN_EDGE_SHARE = 0.5  # of the places along an edge that must change near the line
 
 
 def image_edge(
@@ -48,7 +48,7 @@ def image_edge(
     near_line = np.abs(across - np.polyval(fit, places)[:, None]) <= NEAR_PX * scale
     best = np.where(near_line, change, 0).argmax(1)
     there = (change * near_line).max(1) > np.median(change)
-    if there.sum() < max(LEAST_SHARE * len(places), 8):
+    if there.sum() < max(MIN_EDGE_SHARE * len(places), 8):
         return None
     offset = across[best] + SAMPLE_PX * _peak(change, best)
     points = (ends[0] + places[:, None] * along + offset[:, None] * outward)[there].astype(np.float32)
@@ -61,7 +61,7 @@ def image_edge(
 def smoothed(rgb_u8: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(H, W, 3) shares of red, green and blue without their noise, for `image_edge`: light and shadow do not count."""
     sigma = BLUR_PX * max(rgb_u8.shape[1] / 640, 1.0)
-    smooth = np.asarray(cv2.GaussianBlur(rgb_u8.astype(np.float32), (0, 0), sigma), np.float32) + DARK
+    smooth = np.asarray(cv2.GaussianBlur(rgb_u8.astype(np.float32), (0, 0), sigma), np.float32) + COLOR_SHARE_OFFSET
     return smooth / smooth.sum(-1, keepdims=True)
 
 

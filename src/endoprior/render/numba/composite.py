@@ -28,6 +28,7 @@ from ...compute import simd
 from ...compute.parallel_kernels import parallel_njit
 from ...compute.simd import (
     LANES,
+    broadcast,
     fma,
     lane_numbers,
     larger,
@@ -35,7 +36,6 @@ from ...compute.simd import (
     magnitude,
     prefetch,
     smaller,
-    splat,
     store,
     total,
     where_ge,
@@ -75,11 +75,11 @@ def blend(exponent, transmittance):
     A transmittance below STOP marks a pixel that is full: its magnitude stays what it was and nothing more is added.
     All are vectors.
     """
-    zero = splat(f4(0.0))
-    alpha = smaller(simd.power_of_two(exponent), splat(LARGEST_ALPHA))
-    alpha = where_ge(exponent, splat(LOG2_ALPHA_MIN), alpha, zero)
+    zero = broadcast(f4(0.0))
+    alpha = smaller(simd.power_of_two(exponent), broadcast(LARGEST_ALPHA))
+    alpha = where_ge(exponent, broadcast(LOG2_ALPHA_MIN), alpha, zero)
     behind = fma(-transmittance, alpha, transmittance)
-    stop = splat(STOP)
+    stop = broadcast(STOP)
     weight = where_ge(behind, stop, transmittance * alpha, zero)
     return alpha, weight, where_ge(behind, stop, behind, -magnitude(transmittance))
 
@@ -88,19 +88,19 @@ def blend(exponent, transmittance):
 def _unpack(record, top):
     # One Gaussian as vectors: root, root k, m_log2, log2(opacity), y from `top`; colors and z; their slopes.
     root, m_log2, log2_opacity = (
-        splat(record[tiles.ROOT]),
-        splat(record[tiles.M_LOG2]),
-        splat(record[tiles.LOG2_OPACITY]),
+        broadcast(record[tiles.ROOT]),
+        broadcast(record[tiles.M_LOG2]),
+        broadcast(record[tiles.LOG2_OPACITY]),
     )
-    root_k, center_y = splat(record[tiles.ROOT] * record[tiles.K]), splat(record[tiles.Y] - top)
+    root_k, center_y = broadcast(record[tiles.ROOT] * record[tiles.K]), broadcast(record[tiles.Y] - top)
     red, green, blue, z = (
-        splat(record[tiles.RED]),
-        splat(record[tiles.GREEN]),
-        splat(record[tiles.BLUE]),
-        splat(record[tiles.Z]),
+        broadcast(record[tiles.RED]),
+        broadcast(record[tiles.GREEN]),
+        broadcast(record[tiles.BLUE]),
+        broadcast(record[tiles.Z]),
     )
-    red_x, green_x, blue_x = splat(record[SLOPES]), splat(record[SLOPES + 1]), splat(record[SLOPES + 2])
-    red_y, green_y, blue_y = splat(record[SLOPES + 3]), splat(record[SLOPES + 4]), splat(record[SLOPES + 5])
+    red_x, green_x, blue_x = broadcast(record[SLOPES]), broadcast(record[SLOPES + 1]), broadcast(record[SLOPES + 2])
+    red_y, green_y, blue_y = broadcast(record[SLOPES + 3]), broadcast(record[SLOPES + 4]), broadcast(record[SLOPES + 5])
     geometry, color = (root, root_k, m_log2, log2_opacity, center_y), (red, green, blue, z)
     return geometry, color, (red_x, green_x, blue_x), (red_y, green_y, blue_y)
 
@@ -126,10 +126,10 @@ def _blend_pair(record, pair, left, top, state):
     red_y, green_y, blue_y = along_y
     for strip in range(STRIPS):
         first, end = pair[FIRST_ROWS + 2 * strip], pair[FIRST_ROWS + 2 * strip + 1]
-        dx = lane_numbers() - splat(record[tiles.X] - left - f4(strip * LANES))
+        dx = lane_numbers() - broadcast(record[tiles.X] - left - f4(strip * LANES))
         base = root * dx
         column_red, column_green, column_blue = fma(red_x, dx, red), fma(green_x, dx, green), fma(blue_x, dx, blue)
-        y = splat(f4(first))
+        y = broadcast(f4(first))
         place = strip * FORWARD_STRIP + first * FORWARD_ROW
         for _ in range(first, end):
             dy = y - center_y
@@ -142,7 +142,7 @@ def _blend_pair(record, pair, left, top, state):
             store(state, place + 3 * LANES, fma(weight, shown_blue, load(state, place + 3 * LANES)))
             store(state, place + 4 * LANES, fma(weight, z, load(state, place + 4 * LANES)))
             place += FORWARD_ROW
-            y = y + splat(f4(1.0))
+            y = y + broadcast(f4(1.0))
 
 
 @njit(cache=True, error_model="numpy")
@@ -195,14 +195,14 @@ def _differentiate_pair(record, pair, left, top, state, sums):
     red, green, blue, z = color
     red_x, green_x, blue_x = along_x
     red_y, green_y, blue_y = along_y
-    one, zero = splat(f4(1.0)), splat(f4(0.0))
+    one, zero = broadcast(f4(1.0)), broadcast(f4(0.0))
     s_1 = s_x = s_y = s_xx = s_xy = s_yy = s_red = s_green = s_blue = s_z = zero
     s_red_x = s_green_x = s_blue_x = s_red_y = s_green_y = s_blue_y = zero
     for strip in range(STRIPS):
         first, end = pair[FIRST_ROWS + 2 * strip], pair[FIRST_ROWS + 2 * strip + 1]
-        dx = lane_numbers() - splat(record[tiles.X] - left - f4(strip * LANES))
+        dx = lane_numbers() - broadcast(record[tiles.X] - left - f4(strip * LANES))
         base = root * dx
-        y = splat(f4(first))
+        y = broadcast(f4(first))
         shade_red, shade_green, shade_blue = fma(red_x, dx, red), fma(green_x, dx, green), fma(blue_x, dx, blue)
         # dx is the same on all rows: its sums can wait until the strip is done
         column_1 = column_y = column_red = column_green = column_blue = zero
@@ -220,7 +220,7 @@ def _differentiate_pair(record, pair, left, top, state, sums):
             rest = load(state, place + 5 * LANES) - gain
             store(state, place + 5 * LANES, rest)
             # rest alpha / (1 - alpha), as weight = T alpha and behind = T (1 - alpha)
-            dp = where_ge(alpha, splat(LARGEST_ALPHA), zero, gain - rest * weight / behind)
+            dp = where_ge(alpha, broadcast(LARGEST_ALPHA), zero, gain - rest * weight / behind)
             dp_dy = dp * dy
             column_1 = column_1 + dp
             column_y = column_y + dp_dy

@@ -121,7 +121,7 @@ def _axes(view, quat, scales, turn, axes):
 
 
 @njit(inline="always")
-def _spread(lens, x, y, z, axes):
+def _projected_axes(lens, x, y, z, axes):
     # Rows of J times the axes (Jacobian limited to the neighborhood of the image), and the limited slopes.
     slope_x, slope_y = min(max(x / z, lens[4]), lens[5]), min(max(y / z, lens[6]), lens[7])
     gx, gy = lens[0] / z, lens[1] / z
@@ -171,7 +171,7 @@ def project_forward(
             if not z > NEAR_Z:  # False for NaN
                 continue
             _, _, _, _, length = _axes(view, quats[g], scales[g], turn, axes)
-            _, _, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
+            _, _, b0, b1, b2, c0, c1, c2 = _projected_axes(lens, x, y, z, axes)
             xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
             px, py = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
 
@@ -253,7 +253,7 @@ def project_backward(
                 continue
             wx, wy, wz, x, y, z = _center(view, means[g])
             qw, qx, qy, qz, length = _axes(view, quats[g], scales[g], turn, axes)
-            slope_x, slope_y, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
+            slope_x, slope_y, b0, b1, b2, c0, c1, c2 = _projected_axes(lens, x, y, z, axes)
             xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
 
             # LDL^T factors -> covariance -> rows of J times the axes.
