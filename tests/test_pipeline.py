@@ -13,8 +13,9 @@ from video_files import write_video
 
 from endoprior.check import Finding
 from endoprior.cli import main
+from endoprior.cli.jobs import resume_words, shown_lines
 from endoprior.cli.progress import step_head
-from endoprior.cli.run import Run, resume_words, shown_lines
+from endoprior.cli.run import Run
 from endoprior.core.checks import InputError, quotation
 from endoprior.core.shell import command
 from endoprior.data import load_sequence

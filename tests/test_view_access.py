@@ -16,14 +16,9 @@ from websockets.sync.server import serve
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
-from endoprior.view.access_control import (
-    RateLimit,
-    access_control,
-    check_address,
-    is_known_host,
-    is_open,
-    names_of_machine,
-)
+from endoprior.view.access_control import access_control
+from endoprior.view.addresses import check_address, is_known_host, is_open, names_of_machine
+from endoprior.view.incoming import RateLimit
 from endoprior.view.panel import IMAGE
 from endoprior.view.server import Viewer
 from endoprior.view.viewable_scene import ViewableScene

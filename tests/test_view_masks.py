@@ -16,7 +16,7 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence, writer
 from endoprior.tool_masks.clicked_tools import SearchStep, ToolClick, check_clicks
 from endoprior.view import layers
-from endoprior.view.access_control import JobQueue
+from endoprior.view.incoming import JobQueue
 from endoprior.view.mask_editor import MaskEditor, MaskEdits, stroke
 from endoprior.view.server import Viewer
 from endoprior.view.viewable import ViewSettings

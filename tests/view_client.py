@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from websockets.protocol import State
 from websockets.sync.client import connect
 
-from endoprior.view.access_control import BRUSH_NODE
+from endoprior.view.incoming import BRUSH_NODE
 from endoprior.view.panel import control_id
 
 VISER = f"viser-v{version('viser')}"

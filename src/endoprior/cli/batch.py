@@ -18,7 +18,8 @@ from ..data.reading import kind_of, read_text
 from ..system.console import say
 from .arguments import Command, option_name
 from .devices import with_device
-from .run import Run, do_all
+from .jobs import do_all
+from .run import Run
 from .train import Train, require_gaussians
 
 if TYPE_CHECKING:

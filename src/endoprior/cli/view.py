@@ -47,7 +47,7 @@ class View(Command):
 
     def execute(self) -> None:
         """Serve until interrupted."""
-        from ..view.access_control import check_address, check_names, is_open
+        from ..view.addresses import check_address, check_names, is_open
         from ..view.server import Viewer
 
         check_names(self.allow_host)
@@ -69,7 +69,7 @@ def live_view(port: int | None) -> Iterator[Observer]:
     if port is None:
         yield lambda _report, _trainer: None
         return
-    from ..view.access_control import check_address
+    from ..view.addresses import check_address
     from ..view.live import LiveView
 
     check_address("127.0.0.1", port)

@@ -7,6 +7,8 @@ decoded. `N` frames.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +26,7 @@ from .formats import DatasetFormat
 from .frame_files import Kind, files_of_images, missing_numbers, one_per_frame
 from .images import (
     DEPTH_SUFFIXES,
+    Size,
     decode_image,
     read_color,
     read_depth,
@@ -44,16 +47,42 @@ STILL_HINT = f"{POSES_HINT[:-1]}; for a static camera, set data.format to plain.
 ASSUMED_FOCAL = 0.9
 """Focal length in image widths if none is given: a field of view of 58 degrees, typical of endoscopes."""
 RAW_STEREOMIS = "StereoCalibration.ini"
+PoseAxes = Literal["opencv", "opengl"]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A folder of images, masks, depth and poses: which of them it must have, and how they are stored."""
+
+    name: str
+    image_suffixes: tuple[str, ...]
+    depth_suffixes: tuple[str, ...]
+    read_depth: Callable[[Path, float, Size], NDArray[np.float32]]
+    """Depth, mm, of a file, of its number of mm per unit, and of the images' (width, height)."""
+    required: tuple[str, ...] = ()
+    """What must be there, of `masks`, `depth` and `POSES`. Without masks every pixel counts as tissue, without poses
+    the camera is static."""
+    lens_file: str | None = None
+    """A camera matrix that counts where `sequence.json` has no focal length."""
+    depth_is_mm: bool = False
+    """Depth without a unit is in mm; else its scale is unknown."""
+    has_truth: bool = False
+    """`truth/` is read."""
+
+
+ENDONERF = Layout(
+    "EndoNeRF", (".png",), (".png",), read_depth, ("masks", "depth", POSES), depth_is_mm=True, has_truth=True
+)
+IMAGES_ALONE = Layout("plain", IMAGE_SUFFIXES, DEPTH_SUFFIXES, read_depth_file, lens_file=MATRIX_FILE)
 
 
 def load_endonerf(
     path: Path,
     cfg: DataConfig,
     *,
-    pose_axes: Literal["opencv", "opengl"] = "opencv",
+    pose_axes: PoseAxes = "opencv",
     facts: dict[str, Any] | None = None,
-    fact_files: list[Path] | None = None,
-    complete: bool = True,
+    fact_files: Sequence[Path] = (),
 ) -> FrameSequence:
     """Open a folder in the EndoNeRF layout.
 
@@ -64,83 +93,8 @@ def load_endonerf(
             z forward; as stored by EndoNeRF) or `opengl` (x right, y up, z backward).
         facts: entries of `sequence.json` that a dataset has elsewhere; the file itself overrides them.
         fact_files: the files they come from.
-        complete: masks, depth and poses must be there, as PNG; see `load_plain`.
     """
-    layout, kinds = ("EndoNeRF", (".png",)) if complete else ("plain", IMAGE_SUFFIXES)
-    remarks: list[str] = []
-    images, note = one_per_frame(path / "images", list_files(path / "images", kinds, layout), "images")
-    if len(images) < 2:
-        raise input_error(path / "images", "at least 2 frames, 1 to train and 1 to test", "1", "add frames.")
-    missing = missing_numbers(images)
-    remarks += [each for each in (note, missing and f"{path / 'images'}: {missing}") if each]
-
-    def column(name: str, kind: Kind, suffixes: tuple[str, ...], required: bool, missing: str) -> dict[int, Path]:
-        """The file of each image in a folder."""
-        if required or (path / name).is_dir():
-            return files_of_images(path / name, list_files(path / name, suffixes, layout), kind, images, remarks)
-        remarks.append(f"{path / name}: missing{missing}")
-        return {}
-
-    mask_folder = "gt_masks" if cfg.use_gt_masks else "masks"
-    # A folder that the user names must exist.
-    masks = column(mask_folder, "masks", (".png",), complete or cfg.use_gt_masks, ", every pixel counts as tissue")
-    kinds = (".png",) if complete else DEPTH_SUFFIXES
-    depths = column("depth", "depth", kinds, complete, "; endoprior prepare adds it")
-    described = (facts or {}) | read_description(path / "sequence.json")
-    weights = frame_weights(path / "sequence.json", described, len(images))
-    unit = cfg.depth_unit_mm or described.get("depth_scale")
-    if depths and not unit and not complete:
-        remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
-    height, width = read_color(images[0]).shape[:2]
-    size = (width, height)
-    cameras = _cameras(path, described, size, len(images), pose_axes, remarks, complete=complete)
-    kept = kept_frames(len(images), cfg, having=[files for files in (masks, depths) if files or complete])
-    relative = described.get("depth_relative", not unit and not complete)
-    right_eye = open_right_eye(path, images, kept, size, described, cfg.shrink, remarks, relative=relative)
-    new_masks = [] if masks or len(kept) < len(images) else [path / "masks" / f"{image.stem}.png" for image in images]
-    images = [images[i] for i in kept]
-    mask_files, depth_files = ([files[i] for i in kept] if files else [] for files in (masks, depths))
-    sureness = [path / CONFIDENCE / f"{image.stem}.png" for image in images]
-    sureness = sureness if cfg.reliability == "used" and depths and (path / CONFIDENCE).is_dir() else []
-    tool_value = described.get("mask_tool_value", 255)
-
-    def decode(index: int) -> Pixels:
-        tissue, depth = np.ones((height, width), bool), np.zeros((height, width), np.float32)
-        if mask_files:
-            tissue = ~read_tool_mask(mask_files[index], tool_value, size)
-        if depth_files:
-            depth = (read_depth if complete else read_depth_file)(depth_files[index], unit or 1.0, size)
-        return read_color(images[index], size), tissue, depth
-
-    truth = None
-    if complete and (path / "truth").is_dir():
-        if cfg.shrink > 1 or len(kept) < len(cameras):
-            remarks.append(f"{path / 'truth'}: ignored, because it belongs to the whole sequence at full size")
-        else:
-            truth = Truth(path / "truth", [file.stem for file in images])
-    rate = described.get("frames_per_second")
-    facts_here = [path / name for name in ("sequence.json", POSES, *([] if complete else [MATRIX_FILE]))]
-    return assemble(
-        path,
-        cfg,
-        [cameras[i] for i in kept],
-        decode,
-        images=images,
-        files=[*mask_files, *depth_files, *sureness, *filter(Path.exists, facts_here), *(fact_files or [])],
-        frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
-        truth=truth,
-        right_eye=right_eye,
-        remarks=remarks,
-        mask_folder=mask_folder,
-        mask_files=mask_files,
-        new_mask_files=new_masks,
-        mask_tool_value=tool_value,
-        depth_is_relative=relative,
-        scale=described_scale(path / "sequence.json", described),
-        sources=described.get("sources") or {},
-        frame_weights=weights[kept],
-        confidence=(lambda index: read_share(sureness[index], size)) if sureness else None,
-    )
+    return _load(path, cfg, ENDONERF, pose_axes, facts, fact_files)
 
 
 def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
@@ -148,26 +102,169 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
 
     A remark names everything that is missing and assumed.
     """
-    return load_endonerf(path, cfg, complete=False)
+    return _load(path, cfg, IMAGES_ALONE)
+
+
+def _load(
+    path: Path,
+    cfg: DataConfig,
+    layout: Layout,
+    pose_axes: PoseAxes = "opencv",
+    facts: dict[str, Any] | None = None,
+    fact_files: Sequence[Path] = (),
+) -> FrameSequence:
+    """Open a folder in a layout; the other arguments are those of `load_endonerf`."""
+    remarks: list[str] = []
+    found = _find_files(path, cfg, layout, remarks)
+    description = path / "sequence.json"
+    described = (facts or {}) | read_description(description)
+    weights = frame_weights(description, described, len(found.images))
+    unit = cfg.depth_unit_mm or described.get("depth_scale")
+    scale_is_unknown = not unit and not layout.depth_is_mm
+    if found.depths and scale_is_unknown:
+        remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
+    height, width = read_color(found.images[0]).shape[:2]
+    size = (width, height)
+    cameras = _cameras(path, layout, described, size, len(found.images), pose_axes, remarks)
+    kept = found.kept(cfg, layout)
+    relative = described.get("depth_relative", scale_is_unknown)
+    right_eye = open_right_eye(path, found.images, kept, size, described, cfg.shrink, remarks, relative=relative)
+    frames, tool_value = _kept_files(path, cfg, found, kept), described.get("mask_tool_value", 255)
+    rate = described.get("frames_per_second")
+    facts_here = [path / name for name in ("sequence.json", POSES, layout.lens_file) if name]
+    return assemble(
+        path,
+        cfg,
+        [cameras[i] for i in kept],
+        _decoder(frames, layout, size, unit or 1.0, tool_value),
+        images=frames.images,
+        files=[*frames.masks, *frames.depths, *frames.confidence, *filter(Path.exists, facts_here), *fact_files],
+        frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
+        truth=_open_truth(path, cfg, frames, len(cameras), remarks) if layout.has_truth else None,
+        right_eye=right_eye,
+        remarks=remarks,
+        mask_folder=_mask_folder(cfg),
+        mask_files=frames.masks,
+        new_mask_files=_new_mask_files(path, found, kept),
+        mask_tool_value=tool_value,
+        depth_is_relative=relative,
+        scale=described_scale(description, described),
+        sources=described.get("sources") or {},
+        frame_weights=weights[kept],
+        confidence=(lambda index: read_share(frames.confidence[index], size)) if frames.confidence else None,
+    )
+
+
+@dataclass(frozen=True)
+class _FoundFiles:
+    """The files of a folder. Masks and depths by position of their image; empty where the folder has none."""
+
+    images: list[Path]
+    masks: dict[int, Path]
+    depths: dict[int, Path]
+
+    def kept(self, cfg: DataConfig, layout: Layout) -> list[int]:
+        """Positions of the images to read: those that the config selects, with a mask and depth where others have."""
+        parts = {"masks": self.masks, "depth": self.depths}
+        having = [files for name, files in parts.items() if files or name in layout.required]
+        return kept_frames(len(self.images), cfg, having=having)
+
+
+@dataclass(frozen=True)
+class _KeptFiles:
+    """The files of each frame that is read; empty where the folder has none."""
+
+    images: list[Path]
+    masks: list[Path]
+    depths: list[Path]
+    confidence: list[Path]
+
+
+def _mask_folder(cfg: DataConfig) -> str:
+    return "gt_masks" if cfg.use_gt_masks else "masks"
+
+
+def _find_files(path: Path, cfg: DataConfig, layout: Layout, remarks: list[str]) -> _FoundFiles:
+    """Which files a folder has; `remarks` gets what is missing or left out."""
+    folder = path / "images"
+    images, note = one_per_frame(folder, list_files(folder, layout.image_suffixes, layout.name), "images")
+    if len(images) < 2:
+        raise input_error(folder, "at least 2 frames, 1 to train and 1 to test", "1", "add frames.")
+    missing = missing_numbers(images)
+    remarks += [each for each in (note, missing and f"{folder}: {missing}") if each]
+    # A folder that the user names must exist.
+    required = (*layout.required, "masks") if cfg.use_gt_masks else layout.required
+
+    def files_in(folder: Path, kind: Kind, suffixes: tuple[str, ...], without: str) -> dict[int, Path]:
+        """The file of each image in a folder."""
+        if kind in required or folder.is_dir():
+            return files_of_images(folder, list_files(folder, suffixes, layout.name), kind, images, remarks)
+        remarks.append(f"{folder}: missing{without}")
+        return {}
+
+    masks = files_in(path / _mask_folder(cfg), "masks", (".png",), ", every pixel counts as tissue")
+    depths = files_in(path / "depth", "depth", layout.depth_suffixes, "; endoprior prepare adds it")
+    return _FoundFiles(images, masks, depths)
+
+
+def _kept_files(path: Path, cfg: DataConfig, found: _FoundFiles, kept: list[int]) -> _KeptFiles:
+    """The files of the kept frames."""
+    images = [found.images[i] for i in kept]
+    masks, depths = ([files[i] for i in kept] if files else [] for files in (found.masks, found.depths))
+    folder = path / CONFIDENCE
+    is_used = cfg.reliability == "used" and bool(found.depths) and folder.is_dir()
+    return _KeptFiles(images, masks, depths, [folder / f"{image.stem}.png" for image in images] if is_used else [])
+
+
+def _new_mask_files(path: Path, found: _FoundFiles, kept: list[int]) -> list[Path]:
+    """Where masks can be added: for a folder without any, of which every frame is read."""
+    if found.masks or len(kept) < len(found.images):
+        return []
+    return [path / "masks" / f"{image.stem}.png" for image in found.images]
+
+
+def _decoder(
+    files: _KeptFiles, layout: Layout, size: Size, mm_per_unit: float, tool_value: int
+) -> Callable[[int], Pixels]:
+    """Reads the pixels of kept frame i."""
+    width, height = size
+
+    def decode(index: int) -> Pixels:
+        tissue, depth = np.ones((height, width), bool), np.zeros((height, width), np.float32)
+        if files.masks:
+            tissue = ~read_tool_mask(files.masks[index], tool_value, size)
+        if files.depths:
+            depth = layout.read_depth(files.depths[index], mm_per_unit, size)
+        return read_color(files.images[index], size), tissue, depth
+
+    return decode
+
+
+def _open_truth(path: Path, cfg: DataConfig, files: _KeptFiles, count: int, remarks: list[str]) -> Truth | None:
+    """The truth of a folder of `count` frames; None, with a remark, where it does not fit those that are read."""
+    folder = path / "truth"
+    if not folder.is_dir():
+        return None
+    if cfg.shrink > 1 or len(files.images) < count:
+        remarks.append(f"{folder}: ignored, because it belongs to the whole sequence at full size")
+        return None
+    return Truth(folder, [file.stem for file in files.images])
 
 
 def _cameras(
     path: Path,
+    layout: Layout,
     described: dict[str, Any],
-    size: tuple[int, int],
+    size: Size,
     count: int,
-    pose_axes: Literal["opencv", "opengl"],
+    pose_axes: PoseAxes,
     remarks: list[str],
-    *,
-    complete: bool,
 ) -> list[Camera]:
     """One camera per frame. Intrinsics come from `sequence.json` where it has them, else from row 0 of the poses."""
     width, height = size
-    if not complete and "fx" not in described and (path / MATRIX_FILE).is_file():
-        matrix = read_camera_matrix(path / MATRIX_FILE)
-        described |= {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    described = described if "fx" in described else described | _lens_beside(path, layout)
     focal, poses = ASSUMED_FOCAL * width, identity_poses(count)
-    if complete or (path / POSES).exists():
+    if POSES in layout.required or (path / POSES).exists():
         stored = read_poses_bounds(path / POSES, count)
         flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])
         poses = [world_to_camera(pose[:, :3] * flip, pose[:, 3]) for pose in stored]
@@ -179,6 +276,14 @@ def _cameras(
             remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
     intrinsics = intrinsics_of(path / "sequence.json", described, width, height, focal)
     return [Camera(width, height, *intrinsics, pose) for pose in poses]
+
+
+def _lens_beside(path: Path, layout: Layout) -> dict[str, float]:
+    """The intrinsics in the layout's `lens_file`, as `sequence.json` names them; empty without."""
+    if layout.lens_file is None or not (path / layout.lens_file).is_file():
+        return {}
+    matrix = read_camera_matrix(path / layout.lens_file)
+    return {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
 
 
 def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
@@ -195,7 +300,7 @@ def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
     return poses
 
 
-def focal_at(path: Path, poses: NDArray[np.float64], size: tuple[int, int], remarks: list[str]) -> float:
+def focal_at(path: Path, poses: NDArray[np.float64], size: Size, remarks: list[str]) -> float:
     """Focal length, px, of images of that (width, height), from the first of the stored poses of `poses_bounds.npy`."""
     height, width, focal = poses[0, :, 4].tolist()
     if focal <= 0:

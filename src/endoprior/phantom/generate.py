@@ -15,14 +15,15 @@ from ..data.sequence import is_test_frame
 from ..data.writer import FrameFiles, SequenceMeta, new_sequence
 from .camera import STILL, Eye
 from .config import PhantomConfig
-from .events import Event, disturbed, is_mirrored, parse_events, shows_body
-from .scene import Moment, PhantomScene, build_scene
-from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth, vignette
+from .events import is_mirrored, parse_events, shows_body
+from .recording import Exposure, RecordedFrame, RenderedFrame, record, render_frame, rows_after_cuts, with_events
+from .scene import PhantomScene, build_scene
+from .sensor import develop, vignette
 from .sheet import tangents
 from .sinus import build_sinus
 from .texture import smooth_patches
 from .tube import build_tube, write_tube
-from .views import pixel_hits, render_tissue, render_view, shown_elsewhere, side_eyes, side_view, visible_points
+from .views import pixel_hits, render_tissue, shown_elsewhere, side_eyes, side_view, visible_points
 
 Mask = NDArray[np.bool_]
 RED = (250, 10, 20)
@@ -154,64 +155,101 @@ def write_phantom(
         outside = border(cfg)
         if cfg.border != "none":
             writer.write_array("truth/border.npy", outside)
-        if cfg.scene != "cavity":
-            tube = build_tube(cfg) if cfg.scene == "tube" else build_sinus(cfg)
-            write_tube(writer, tube, cfg, outside, progress)
-            return
-        scene = build_scene(cfg)
-        tracked = choose_tracks(scene)
-        lens = vignette(cfg.width, cfg.height)
-        # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
-        rim = np.ones((3, 3), np.uint8)
-        points, visible, gains, sides, gain, first_gain, wanted = [], [], [], {}, 0.0, 0.0, 0.0
-        events = parse_events(cfg.events, cfg.frames)
-        ever_seen, behind_tools = np.zeros(scene.a.shape, bool), {}
-        for index in range(cfg.frames):
-            now = Moment.of(scene, index / (cfg.frames - 1))
-            view = render_view(scene, now, STILL)
-            z = pixel_hits(now.vertices, cfg)[..., 2]
-            if index == 0:
-                first_gain = gain = exposure_gain(view.tissue) * scene.look.exposure
-                wanted = gain * metered(view.image)
-                sides = side_eyes(float(np.median(z))) if cfg.side_views else {}
-            gains.append(gain / first_gain)
-            rng = np.random.default_rng([cfg.seed, 6, index])
-            image = expose(develop(view.image, gain, lens), cfg.noise, rng)
-            mask = cv2.dilate((view.tool_share > 0).astype(np.uint8), rim) > 0
-            right, drawn = None, overlay(cfg, index)
-            if cfg.overlay:
-                writer.write_array(f"truth/overlay/{index:06d}.npy", drawn)
-            if cfg.stereo:
-                other = render_view(scene, now, Eye.moved(cfg.baseline_mm))
-                right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
-            measured = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
-            turned = slice(None, None, -1) if is_mirrored(events, index) else slice(None)
-            tissue = np.round(develop(view.tissue, first_gain, lens)).astype(np.uint8)
-            writer.write_image("truth/tissue", tissue[turned])
-            writer.write_array(f"truth/depth/{index:06d}.npy", z[turned])
-            seen = visible_points(now.vertices, z, mask, cfg)
-            points.append(now.vertices[tracked[:, 0], tracked[:, 1]])
-            is_clear = shows_body(events, index) and not is_mirrored(events, index)
-            visible.append(seen[tracked[:, 0], tracked[:, 1]] & is_clear)
-            if is_test_frame(index):
-                behind_tools[index] = np.packbits(mask)
-                _write_dull(writer, scene, now, first_gain, turned)
-                _write_sides(writer, sides, index, (scene, now, z, mask, first_gain))
-            else:
-                ever_seen |= seen
-            image, mask, measured, right = _disturbed((image, mask, measured, right), events, index, cfg.seed)
-            measured[outside] = 0
-            right = None if right is None else surrounded(right, outside, drawn)
-            writer.add(surrounded(image, outside, drawn), mask | outside | drawn, measured, right)
-            if cfg.gain == "auto":
-                gain = next_gain(gain, metered(view.image), wanted)
-            progress(index + 1, cfg.frames)
-        for index, packed in behind_tools.items():  # what is seen later is known only now
-            hits = pixel_hits(scene.seen_vertices(index / (cfg.frames - 1)), cfg)
+        if cfg.scene == "cavity":
+            _write_cavity(writer, build_scene(cfg), outside, progress)
+        else:
+            write_tube(writer, build_tube(cfg) if cfg.scene == "tube" else build_sinus(cfg), cfg, outside, progress)
+
+
+def _write_cavity(writer: FrameFiles, scene: PhantomScene, outside: Mask, progress: Callable[[int, int], None]) -> None:
+    """Write frames, black and without depth `outside` (H, W), and all truth of the scene `cavity`."""
+    cfg = scene.cfg
+    events, lens = parse_events(cfg.events, cfg.frames), vignette(cfg.width, cfg.height)
+    tracked, points, visible = choose_tracks(scene), [], []
+    behind_tools, sides = _BehindTools(scene), {}
+    exposure, gains = None, []
+    for index in range(cfg.frames):
+        frame = render_frame(scene, index)
+        if exposure is None:
+            exposure = Exposure.of_first(scene, frame)
+            sides = side_eyes(float(np.median(frame.z))) if cfg.side_views else {}
+        gains.append(exposure.now / exposure.first)
+        seen = visible_points(frame.now.vertices, frame.z, frame.tool_mask, cfg)
+        behind_tools.add(frame, seen)
+        points.append(frame.now.vertices[tracked[:, 0], tracked[:, 1]])
+        is_clear = shows_body(events, index) and not is_mirrored(events, index)
+        visible.append(seen[tracked[:, 0], tracked[:, 1]] & is_clear)
+        _write_truth(writer, scene, frame, exposure.first, lens, rows_after_cuts(events, index))
+        if is_test_frame(index):
+            _write_sides(writer, scene, frame, exposure.first, sides)
+        recorded = with_events(record(scene, frame, exposure.now, lens), events, index, cfg.seed)
+        _write_recorded(writer, recorded, outside, overlay(cfg, index))
+        if cfg.gain == "auto":
+            exposure = exposure.after(frame)
+        progress(index + 1, cfg.frames)
+    behind_tools.write(writer)
+    _write_tracks(writer, scene, tracked, points, visible)
+    _write_descriptions(writer, scene, sides, gains)
+
+
+class _BehindTools:
+    """Where the tools of test frames cover tissue that training frames show, which is known after the last frame."""
+
+    def __init__(self, scene: PhantomScene) -> None:
+        self._scene = scene
+        self._trained_on = np.zeros(scene.a.shape, bool)  # (MH, MW) vertices that some training frame shows
+        self._tools: dict[int, NDArray[np.uint8]] = {}  # packed mask of each test frame
+
+    def add(self, frame: RenderedFrame, seen: Mask) -> None:
+        """Note a frame, in which the vertices `seen` (MH, MW) are visible."""
+        if is_test_frame(frame.index):
+            self._tools[frame.index] = np.packbits(frame.tool_mask)
+        else:
+            self._trained_on |= seen
+
+    def write(self, writer: FrameFiles) -> None:
+        """Write `truth/seen`."""
+        cfg = self._scene.cfg
+        for index, packed in self._tools.items():
+            hits = pixel_hits(self._scene.seen_vertices(index / (cfg.frames - 1)), cfg)
             tool = np.unpackbits(packed, count=hits[..., 0].size).reshape(hits.shape[:2]) > 0
-            writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, ever_seen, tool))
-        _write_tracks(writer, scene, tracked, points, visible)
-        _write_descriptions(writer, scene, sides, gains)
+            writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, self._trained_on, tool))
+
+
+def _write_recorded(writer: FrameFiles, recorded: RecordedFrame, outside: Mask, drawn: Mask) -> None:
+    """Append a frame, with the border and the drawing over its images."""
+    right = None if recorded.right is None else surrounded(recorded.right, outside, drawn)
+    depth = np.where(outside, np.float32(0), recorded.depth)
+    writer.add(surrounded(recorded.image, outside, drawn), recorded.tool_mask | outside | drawn, depth, right)
+
+
+def _write_truth(
+    writer: FrameFiles, scene: PhantomScene, frame: RenderedFrame, gain: float, lens: NDArray[np.float32], rows: slice
+) -> None:
+    """What lies behind the tools of a frame: tissue and depth; in test frames also the tissue without highlights,
+    unless smoke as a kind of tissue veils it. And where the drawing is.
+    """
+    index, cfg = frame.index, scene.cfg
+
+    def write_tissue(folder: str, radiance: NDArray) -> None:
+        writer.write_image(folder, np.round(develop(radiance, gain, lens)).astype(np.uint8)[rows], index)
+
+    write_tissue("truth/tissue", frame.view.tissue)
+    writer.write_array(f"truth/depth/{index:06d}.npy", frame.z[rows])
+    if is_test_frame(index) and (scene.smoke is None or cfg.smoke):
+        write_tissue("truth/no_highlights", render_tissue(scene, frame.now, STILL, highlights=False)[0])
+    if cfg.overlay:
+        writer.write_array(f"truth/overlay/{index:06d}.npy", overlay(cfg, index))
+
+
+def _write_sides(
+    writer: FrameFiles, scene: PhantomScene, frame: RenderedFrame, gain: float, sides: dict[str, Eye]
+) -> None:
+    """What the side cameras see of a frame: image and depth."""
+    for name, eye in sides.items():
+        image, depth = side_view(scene, frame.now, eye, frame.z, frame.tool_mask, gain)
+        writer.write_image(f"truth/side/{name}", image, frame.index)
+        writer.write_array(f"truth/side/{name}/{frame.index:06d}.npy", depth)
 
 
 def _write_tracks(
@@ -237,41 +275,6 @@ def _deformed(scene: PhantomScene, tracked: NDArray[np.int64]) -> dict[str, NDAr
         for name, value in zip(found, values, strict=True):
             found[name].append(value)
     return {name: np.stack(values).astype(np.float32) for name, values in found.items()}
-
-
-def _disturbed(
-    frame: tuple[NDArray, NDArray, NDArray, NDArray | None], events: tuple[Event, ...], index: int, seed: int
-) -> tuple[NDArray, NDArray, NDArray, NDArray | None]:
-    """Image, tool mask, measured depth and right image of a frame as its events leave them."""
-    turned = slice(None, None, -1) if is_mirrored(events, index) else slice(None)
-    image, mask, measured, right = (None if each is None else np.ascontiguousarray(each[turned]) for each in frame)
-    assert image is not None and mask is not None and measured is not None
-    if not shows_body(events, index):
-        mask, measured = np.zeros_like(mask), np.zeros_like(measured)
-    right = None if right is None else disturbed(right, events, index, seed)
-    return disturbed(image, events, index, seed), mask, measured, right
-
-
-def _write_dull(writer: FrameFiles, scene: PhantomScene, now: Moment, gain: float, turned: slice) -> None:
-    """The tissue of a frame without highlights, unless smoke as a kind of tissue veils it."""
-    if scene.smoke is None or scene.cfg.smoke:
-        radiance, _ = render_tissue(scene, now, STILL, highlights=False)
-        picture = develop(radiance, gain, vignette(scene.cfg.width, scene.cfg.height))
-        writer.write_image("truth/no_highlights", np.round(picture).astype(np.uint8)[turned])
-
-
-def _write_sides(
-    writer: FrameFiles,
-    sides: dict[str, Eye],
-    index: int,
-    seen: tuple[PhantomScene, Moment, NDArray, NDArray, float],
-) -> None:
-    """What the side cameras see of a frame, as `side_view` takes it: picture and depth."""
-    scene, now, front_z, tool, gain = seen
-    for name, eye in sides.items():
-        picture, depth = side_view(scene, now, eye, front_z, tool, gain)
-        writer.write_image(f"truth/side/{name}", picture)
-        writer.write_array(f"truth/side/{name}/{index:06d}.npy", depth)
 
 
 def _write_descriptions(writer: FrameFiles, scene: PhantomScene, sides: dict[str, Eye], gains: list[float]) -> None:

@@ -20,7 +20,7 @@ from ..data.writer import replace_masks
 from ..footage.carry_masks import CarriedEdit, carry_mask_edit
 from ..tool_masks.clicked_tissue import free_clicked
 from ..tool_masks.clicked_tools import SearchStep, ToolClick, find_clicked
-from .access_control import BRUSH_NODE, JobQueue
+from .incoming import BRUSH_NODE, JobQueue
 
 if TYPE_CHECKING:
     import viser

@@ -12,7 +12,7 @@ from viser import uplot
 
 from ..core.geometry import length_unit
 from ..data.known_length import MOST_MM
-from .access_control import are_numbers
+from .incoming import are_numbers
 from .viewable import Layer, ViewSettings
 
 if TYPE_CHECKING:

@@ -34,9 +34,11 @@ from ..system.atomic import whole_file
 from ..system.console import complain
 from ..visualization.video import write_video
 from . import panel
-from .access_control import Job, JobQueue, Names, RateLimit, access_control, check_address
+from .access_control import access_control
+from .addresses import Names, check_address
 from .browsers import Browsers, camera_pose, picture_with_lines, viewport_of
 from .exports import SCENE_FILES, scene_file
+from .incoming import Job, JobQueue, RateLimit
 from .layers import Lines
 from .mask_editor import MaskEditor, Spot
 from .measure import DrawnTracks, Measuring, pick

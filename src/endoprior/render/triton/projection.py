@@ -93,8 +93,25 @@ def _to_world(lens, i: tl.constexpr, x, y, z):
 
 
 @triton.jit
-def _spread(lens, rx, ry, rz, scale, slope_x, slope_y, gx, gy):
-    # One column of J times the axes, from that of the rotation (rx, ry, rz); and that axis' z in the camera frame.
+def _rotation_column(quat, j: tl.constexpr):
+    # Column j of the rotation by a unit quaternion.
+    w, x, y, z = quat
+    if j == 0:
+        r0, r1, r2 = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+    elif j == 1:
+        r0, r1, r2 = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
+    else:
+        r0, r1, r2 = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+    return r0, r1, r2
+
+
+@triton.jit
+def _spread(lens, quat, row, j: tl.constexpr, slopes, gains, mask):
+    # Column j of J times the axes; and that axis' z in the camera frame.
+    slope_x, slope_y = slopes
+    gx, gy = gains
+    rx, ry, rz = _rotation_column(quat, j)
+    scale = _scale(row, j, mask)
     axis_z = scale * _to_camera(lens, 2, rx, ry, rz)
     b = gx * (scale * _to_camera(lens, 0, rx, ry, rz) - slope_x * axis_z)
     c = gy * (scale * _to_camera(lens, 1, rx, ry, rz) - slope_y * axis_z)
@@ -122,23 +139,19 @@ def _project(means, quats, scales, lens, g, mask):
     # What both passes need: centers, slopes, J times the axes (rows b, c), covariance and its determinant.
     wx, wy, wz, x, y, z = _center(means + 3 * g, lens, mask)
     qw, qx, qy, qz, length = _unit_quat(quats + 4 * g, mask)
+    world, center, quat = (wx, wy, wz), (x, y, z), (qw, qx, qy, qz)
     slope_x = tl.minimum(tl.maximum(x / z, tl.load(lens + LIMITS)), tl.load(lens + LIMITS + 1))
     slope_y = tl.minimum(tl.maximum(y / z, tl.load(lens + LIMITS + 2)), tl.load(lens + LIMITS + 3))
-    gx, gy = tl.load(lens + FX) / z, tl.load(lens + FX + 1) / z
-    r0, r1, r2 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
-    b0, c0, z0 = _spread(lens, r0, r1, r2, _scale(scales + 3 * g, 0, mask), slope_x, slope_y, gx, gy)
-    r0, r1, r2 = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
-    b1, c1, z1 = _spread(lens, r0, r1, r2, _scale(scales + 3 * g, 1, mask), slope_x, slope_y, gx, gy)
-    r0, r1, r2 = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
-    b2, c2, z2 = _spread(lens, r0, r1, r2, _scale(scales + 3 * g, 2, mask), slope_x, slope_y, gx, gy)
+    slopes, gains = (slope_x, slope_y), (tl.load(lens + FX) / z, tl.load(lens + FX + 1) / z)
+    b0, c0, z0 = _spread(lens, quat, scales + 3 * g, 0, slopes, gains, mask)
+    b1, c1, z1 = _spread(lens, quat, scales + 3 * g, 1, slopes, gains, mask)
+    b2, c2, z2 = _spread(lens, quat, scales + 3 * g, 2, slopes, gains, mask)
     bb, bc, cc = b0 * b0 + b1 * b1 + b2 * b2, b0 * c0 + b1 * c1 + b2 * c2, c0 * c0 + c1 * c1 + c2 * c2
     n0, n1, n2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
     blur = _double(_BLUR)
     det = n0 * n0 + n1 * n1 + n2 * n2 + blur * (bb + cc) + blur * blur
-    world, center, quat = (wx, wy, wz), (x, y, z), (qw, qx, qy, qz)
-    spread = (b0, b1, b2, c0, c1, c2)
-    cov = (bb + blur, bc, cc + blur, det)
-    return world, center, quat, length, (slope_x, slope_y), (gx, gy), spread, (z0, z1, z2), cov
+    spread, cov = (b0, b1, b2, c0, c1, c2), (bb + blur, bc, cc + blur, det)
+    return world, center, quat, length, slopes, gains, spread, (z0, z1, z2), cov
 
 
 @triton.jit
@@ -213,36 +226,10 @@ def project_forward(
 
 
 @triton.jit
-def _store_axis(row, v_row, lens, j: tl.constexpr, r0, r1, r2, vb, vc, vz, gx, gy, mask, written):
-    # Column j: dL/d(b, c) -> dL/d(axis in the camera frame) -> dL/d(scale), stored, and dL/d(rotation), returned.
-    v0, v1 = gx * vb, gy * vc
-    m0, m1, m2 = _to_world(lens, 0, v0, v1, vz), _to_world(lens, 1, v0, v1, vz), _to_world(lens, 2, v0, v1, vz)
-    v_scale = m0 * r0 + m1 * r1 + m2 * r2
-    tl.store(v_row + j, _kept(v_scale, mask), written)
-    scale = _scale(row, j, mask)
-    return m0 * scale, m1 * scale, m2 * scale
-
-
-@triton.jit(do_not_specialize=["num"])
-def project_backward(
-    means, quats, scales, sh, color_slopes, lens, num, radii, v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d,
-    v_means, v_quats, v_scales, v_sh, v_color_slopes,
-    DEGREE: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """One program per BLOCK Gaussians. Writes one row of each of the last five tensors; zeros where radii is 0."""
-    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    written = g < num
-    mask = tl.load(radii + g, written, 0) > 0
-    world, center, quat, length, slopes, gains, spread, axes_z, cov = _project(means, quats, scales, lens, g, mask)
-    x, y, z = center
-    qw, qx, qy, qz = quat
-    slope_x, slope_y = slopes
-    gx, gy = gains
-    b0, b1, b2, c0, c1, c2 = spread
-    z0, z1, z2 = axes_z
+def _slopes_backward(color_slopes, v_color_slopes2d, v_color_slopes, spread, cov, g, mask, written):
+    # Slopes of the color, P^T times color_slopes with P = inverse covariance times b, c of two axes -> color_slopes,
+    # stored; P: (b0, b1, c0, c1), without what the covariance adds to it, and covariance (xx, xy, yy), returned.
     xx, xy, yy, det = cov
-
-    # Slopes of the color, P^T times color_slopes with P = inverse covariance times b, c of two axes.
     x0, x1, y0, y1 = _local_per_px(spread, cov)
     v_x0, v_x1, v_y0, v_y1 = tl.zeros_like(x0), tl.zeros_like(x0), tl.zeros_like(x0), tl.zeros_like(x0)
     for i in tl.static_range(3):
@@ -256,13 +243,20 @@ def project_backward(
         v_second = _kept(x1 * along_x + y1 * along_y, mask)
         tl.store(v_color_slopes + 6 * g + i, v_first, written)
         tl.store(v_color_slopes + 6 * g + 3 + i, v_second, written)
-    t_b0, t_c0 = (yy * v_x0 - xy * v_y0) / det, (xx * v_y0 - xy * v_x0) / det
-    t_b1, t_c1 = (yy * v_x1 - xy * v_y1) / det, (xx * v_y1 - xy * v_x1) / det
-    v_xx = -t_b0 * x0 - t_b1 * x1
-    v_yy = -t_c0 * y0 - t_c1 * y1
-    v_xy = -t_b0 * y0 - t_b1 * y1 - t_c0 * x0 - t_c1 * x1
+    vb0, vc0 = (yy * v_x0 - xy * v_y0) / det, (xx * v_y0 - xy * v_x0) / det
+    vb1, vc1 = (yy * v_x1 - xy * v_y1) / det, (xx * v_y1 - xy * v_x1) / det
+    v_xx = -vb0 * x0 - vb1 * x1
+    v_yy = -vc0 * y0 - vc1 * y1
+    v_xy = -vb0 * y0 - vb1 * y1 - vc0 * x0 - vc1 * x1
+    return (vb0, vb1, vc0, vc1), (v_xx, v_xy, v_yy)
 
-    # LDL^T factors -> covariance -> rows of J times the axes.
+
+@triton.jit
+def _covariance_backward(v_conic_ldl, v_cov, v_spread, spread, cov, g, mask):
+    # LDL^T factors -> covariance -> rows b, c of J times the axes. Adds to the `v_cov` and `v_spread` of the slopes.
+    b0, b1, b2, c0, c1, c2 = spread
+    xx, xy, _, det = cov
+    v_xx, v_xy, v_yy = v_cov
     v_a = _double_at(v_conic_ldl + 3 * g, mask)
     v_k = _double_at(v_conic_ldl + 3 * g + 1, mask)
     v_m = _double_at(v_conic_ldl + 3 * g + 2, mask)
@@ -272,9 +266,18 @@ def project_backward(
     v_xx += -v_a * (xy / det) * (xy / det) + (v_k * xy - v_m) / (xx * xx)
     vb0, vb1, vb2 = 2 * v_xx * b0 + v_xy * c0, 2 * v_xx * b1 + v_xy * c1, 2 * v_xx * b2 + v_xy * c2
     vc0, vc1, vc2 = 2 * v_yy * c0 + v_xy * b0, 2 * v_yy * c1 + v_xy * b1, 2 * v_yy * c2 + v_xy * b2
-    vb0, vb1, vc0, vc1 = vb0 + t_b0, vb1 + t_b1, vc0 + t_c0, vc1 + t_c1
+    slope_b0, slope_b1, slope_c0, slope_c1 = v_spread
+    return vb0 + slope_b0, vb1 + slope_b1, vb2, vc0 + slope_c0, vc1 + slope_c1, vc2
 
-    # Rows of J times the axes, and the center in the image -> center in the camera frame.
+
+@triton.jit
+def _center_backward(lens, v_means2d, v_z, v_spread, center, gains, spread, axes_z, g, mask):
+    # Center in the image, z, and rows of J times the axes -> center in the camera frame.
+    x, y, z = center
+    gx, gy = gains
+    b0, b1, b2, c0, c1, c2 = spread
+    z0, z1, z2 = axes_z
+    vb0, vb1, vb2, vc0, vc1, vc2 = v_spread
     v_x = _double_at(v_means2d + 2 * g, mask) * gx
     v_y = _double_at(v_means2d + 2 * g + 1, mask) * gy
     v_depth = _double_at(v_z + g, mask) - (v_x * x + v_y * y) / z
@@ -287,8 +290,12 @@ def project_backward(
     v_slope = tl.where(inside, -gy * (vc0 * z0 + vc1 * z1 + vc2 * z2), 0.0)
     v_y += v_slope / z
     v_depth -= v_slope * y / (z * z)
+    return v_x, v_y, v_depth
 
-    # Color -> coefficients and direction of view -> mean.
+
+@triton.jit
+def _color_backward(sh, v_sh, v_colors, world, lens, g, mask, written, DEGREE: tl.constexpr):
+    # Color -> coefficients, stored, and direction of view -> mean in the world, returned.
     ux, uy, uz, inverse = _direction(world, lens)
     fx, fy, fz = ux.to(tl.float32), uy.to(tl.float32), uz.to(tl.float32)
     num_sh: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
@@ -301,28 +308,65 @@ def project_backward(
     wx, wy, wz = pull_back(row, v_row, fx, fy, fz, vr, vg, vb, mask, written, DEGREE)
     dx, dy, dz = wx.to(tl.float64), wy.to(tl.float64), wz.to(tl.float64)
     along = dx * ux + dy * uy + dz * uz
-    dx, dy, dz = inverse * (dx - along * ux), inverse * (dy - along * uy), inverse * (dz - along * uz)
-    dx, dy = dx + _to_world(lens, 0, v_x, v_y, v_depth), dy + _to_world(lens, 1, v_x, v_y, v_depth)
-    dz += _to_world(lens, 2, v_x, v_y, v_depth)
-    store_three(v_means + 3 * g, _kept(dx, mask), _kept(dy, mask), _kept(dz, mask), written)
+    return inverse * (dx - along * ux), inverse * (dy - along * uy), inverse * (dz - along * uz)
 
-    # Axes = view R diag(scales) -> scales and R (m_ij holds dL/dR) -> quaternion, through its normalization.
-    v_axis = -slope_x * gx * vb0 - slope_y * gy * vc0
-    r0, r1, r2 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
-    srow, v_srow = scales + 3 * g, v_scales + 3 * g
-    m00, m10, m20 = _store_axis(srow, v_srow, lens, 0, r0, r1, r2, vb0, vc0, v_axis, gx, gy, mask, written)
-    v_axis = -slope_x * gx * vb1 - slope_y * gy * vc1
-    r0, r1, r2 = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
-    m01, m11, m21 = _store_axis(srow, v_srow, lens, 1, r0, r1, r2, vb1, vc1, v_axis, gx, gy, mask, written)
-    v_axis = -slope_x * gx * vb2 - slope_y * gy * vc2
-    r0, r1, r2 = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
-    m02, m12, m22 = _store_axis(srow, v_srow, lens, 2, r0, r1, r2, vb2, vc2, v_axis, gx, gy, mask, written)
+
+@triton.jit
+def _axis_backward(row, v_row, lens, quat, j: tl.constexpr, vb, vc, slopes, gains, mask, written):
+    # dL/d(b, c) of axis j -> dL/d(axis in the camera frame) -> dL/d(scale), stored, and dL/d(rotation), returned.
+    slope_x, slope_y = slopes
+    gx, gy = gains
+    r0, r1, r2 = _rotation_column(quat, j)
+    vz = -slope_x * gx * vb - slope_y * gy * vc
+    v0, v1 = gx * vb, gy * vc
+    m0, m1, m2 = _to_world(lens, 0, v0, v1, vz), _to_world(lens, 1, v0, v1, vz), _to_world(lens, 2, v0, v1, vz)
+    v_scale = m0 * r0 + m1 * r1 + m2 * r2
+    tl.store(v_row + j, _kept(v_scale, mask), written)
+    scale = _scale(row, j, mask)
+    return m0 * scale, m1 * scale, m2 * scale
+
+
+@triton.jit
+def _quat_backward(v_row, quat, length, v_column0, v_column1, v_column2, mask, written):
+    # dL/d(columns of the rotation) -> dL/d(quaternion), through its normalization, stored.
+    qw, qx, qy, qz = quat
+    m00, m10, m20 = v_column0
+    m01, m11, m21 = v_column1
+    m02, m12, m22 = v_column2
     v_w = 2 * (qx * (m21 - m12) + qy * (m02 - m20) + qz * (m10 - m01))
     v_i = 2 * (qy * (m01 + m10) + qz * (m02 + m20) + qw * (m21 - m12)) - 4 * qx * (m11 + m22)
     v_j = 2 * (qx * (m01 + m10) + qz * (m12 + m21) + qw * (m02 - m20)) - 4 * qy * (m00 + m22)
     v_k = 2 * (qx * (m02 + m20) + qy * (m12 + m21) + qw * (m10 - m01)) - 4 * qz * (m00 + m11)
     along = v_w * qw + v_i * qx + v_j * qy + v_k * qz
-    tl.store(v_quats + 4 * g, _kept((v_w - along * qw) / length, mask), written)
-    tl.store(v_quats + 4 * g + 1, _kept((v_i - along * qx) / length, mask), written)
-    tl.store(v_quats + 4 * g + 2, _kept((v_j - along * qy) / length, mask), written)
-    tl.store(v_quats + 4 * g + 3, _kept((v_k - along * qz) / length, mask), written)
+    tl.store(v_row, _kept((v_w - along * qw) / length, mask), written)
+    tl.store(v_row + 1, _kept((v_i - along * qx) / length, mask), written)
+    tl.store(v_row + 2, _kept((v_j - along * qy) / length, mask), written)
+    tl.store(v_row + 3, _kept((v_k - along * qz) / length, mask), written)
+
+
+@triton.jit(do_not_specialize=["num"])
+def project_backward(
+    means, quats, scales, sh, color_slopes, lens, num, radii, v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d,
+    v_means, v_quats, v_scales, v_sh, v_color_slopes,
+    DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One program per BLOCK Gaussians. Writes one row of each of the last five tensors; zeros where radii is 0."""
+    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    written = g < num
+    mask = tl.load(radii + g, written, 0) > 0
+    world, center, quat, length, slopes, gains, spread, axes_z, cov = _project(means, quats, scales, lens, g, mask)
+
+    v_spread, v_cov = _slopes_backward(color_slopes, v_color_slopes2d, v_color_slopes, spread, cov, g, mask, written)
+    v_spread = _covariance_backward(v_conic_ldl, v_cov, v_spread, spread, cov, g, mask)
+    vx, vy, vz = _center_backward(lens, v_means2d, v_z, v_spread, center, gains, spread, axes_z, g, mask)
+    dx, dy, dz = _color_backward(sh, v_sh, v_colors, world, lens, g, mask, written, DEGREE)
+    dx, dy = dx + _to_world(lens, 0, vx, vy, vz), dy + _to_world(lens, 1, vx, vy, vz)
+    dz += _to_world(lens, 2, vx, vy, vz)
+    store_three(v_means + 3 * g, _kept(dx, mask), _kept(dy, mask), _kept(dz, mask), written)
+
+    vb0, vb1, vb2, vc0, vc1, vc2 = v_spread
+    row, v_row = scales + 3 * g, v_scales + 3 * g
+    v_column0 = _axis_backward(row, v_row, lens, quat, 0, vb0, vc0, slopes, gains, mask, written)
+    v_column1 = _axis_backward(row, v_row, lens, quat, 1, vb1, vc1, slopes, gains, mask, written)
+    v_column2 = _axis_backward(row, v_row, lens, quat, 2, vb2, vc2, slopes, gains, mask, written)
+    _quat_backward(v_quats + 4 * g, quat, length, v_column0, v_column1, v_column2, mask, written)
