@@ -14,7 +14,7 @@ from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.basis import TRAINED, basis_offsets
 from endoprior.model.gaussians import temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField
-from endoprior.model.motion import RankOneGradient
+from endoprior.model.offsets import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps

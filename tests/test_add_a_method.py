@@ -26,8 +26,8 @@ from endoprior.evaluation.registry import all_scores
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.method import METHODS, config_from, method_named, method_of
 from endoprior.model.presets import preset, preset_names
+from endoprior.model.scene_facts import FORMAT
 from endoprior.model.scene_file import load_scene
-from endoprior.model.single_scene import FORMAT
 from endoprior.runs.train import train
 from endoprior.system.arrays_file import save_arrays
 from endoprior_studies.spec_file import load_spec

@@ -16,7 +16,7 @@ from .. import render
 from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
-from ..model.scene import RenderedScene
+from ..model.rendered_scene import RenderedScene
 from ..system.arrays_file import ArraySpec
 
 DEFAULT_FRAMES_PER_SECOND = 25.0  # playing speed of a sequence that does not state its own

@@ -12,9 +12,9 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Camera
 from endoprior.data import FrameSequence
-from endoprior.model.method import Method
 from endoprior.model.scene_facts import SceneFacts
 from endoprior.system.arrays_file import ArraySpec, part
+from endoprior.training.method import Method
 
 from . import presets
 from .endonerf import EndoNeRF

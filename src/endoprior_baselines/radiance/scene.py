@@ -12,8 +12,7 @@ from typing_extensions import override
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, RenderedView
 from endoprior.model.scene import RenderedScene
-from endoprior.model.scene_facts import camera_arrays, scene_facts
-from endoprior.model.single_scene import FORMAT
+from endoprior.model.scene_facts import FORMAT, camera_arrays, scene_facts
 from endoprior.render import Backend
 from endoprior.system.arrays_file import save_arrays
 
