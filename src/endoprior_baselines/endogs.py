@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, huber_loss, relu
 from typing_extensions import override
 
+from endoprior.compute.relu_network import relu_network
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.gaussians import Gaussians
@@ -35,7 +36,6 @@ from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
-from .relu_network import relu_network
 from .surface_points import Released
 
 UNIT_MM = 10.0

@@ -20,7 +20,9 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d, normalize
 from typing_extensions import override
 
+from endoprior.compute.frequency_encoding import encoded, encoded_size
 from endoprior.compute.neighbors import nearest
+from endoprior.compute.relu_network import relu_network
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Frame, Splats
@@ -39,8 +41,6 @@ from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_line
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
-from .radiance.layers import encoded, encoded_size
-from .relu_network import relu_network
 from .surface_points import Released, grid_points
 
 PLACE_BANDS, TIME_BANDS = 10, 4

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.config import Config
 from ..core.shell import command
 from ..data import FrameSequence
@@ -29,7 +29,6 @@ from ..model.method import method_of
 from ..model.motion import Field, Motion
 from ..model.photometric import of_all_frames
 from ..model.scene import SingleScene
-from ..model.scene_file import check_cameras
 from ..system.arrays_file import ArraySpec, part
 from .density import scene_extent
 from .density_stats import DensityStats
@@ -44,7 +43,7 @@ from .photometric import ClearedFrames, smoke_of
 from .state import GaussiansState
 from .step import TrainingStep
 from .tracks import StartTracks
-from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
+from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, cameras_of, device_for, stage_length
 
 STILL_CAMERA_SCALE = 10.0  # spatial scale of a sequence with a static camera, mm
 
@@ -103,11 +102,7 @@ class GaussianTrainer(Trainer):
         self.motion = self.method.motion(self.cfg)
         self.device = device_for(cfg.render.backend)
         self.ops = ops or ops_for(self.device)
-        self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
-        try:
-            check_cameras(self.cameras)
-        except InputError as error:
-            raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
+        self.cameras = cameras_of(sequence)
         frames = TrainingFrames(sequence, "zero" if cfg.released.prior else "reflect", self.device)
         centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
         extent = scene_extent(centers)
