@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape
-from ..core.geometry import bilinear, pixel_centers
-from ..core.types import Camera, Frame
+from ..core.geometry import bilinear, pixel_centers, right_camera
+from ..core.types import Frame
 from .components import Image, Mask
 
 SMALL_STEP, LARGE_STEP = 16, 64
@@ -140,19 +140,6 @@ def _gray(left_u8: Image, right_u8: Image) -> list[Image]:
 
 STEEPEST = 1.0  # Neighbors of a row lie on one surface where their disparities differ by less than this, px per px
 NEAREST = 0.5  # A tool without depth may be as near as this share of the smallest measured depth of the frame
-
-
-def right_camera(camera: Camera, baseline_mm: float) -> Camera:
-    """The camera that stands `baseline_mm` along the +x axis of `camera`, with its lens and turned like it."""
-    moved = np.eye(4)
-    moved[0, 3] = -baseline_mm
-    return replace(camera, world_to_camera=moved @ camera.world_to_camera)
-
-
-def share_of_right(camera: Camera, left: Camera, baseline_mm: float) -> float:
-    """How much `camera` sees as the right camera does: 1 there, falls linearly to 0 at the distance of the left one."""
-    away = np.linalg.norm(camera.center - right_camera(left, baseline_mm).center)
-    return float(max(0, 1 - away / baseline_mm))
 
 
 def warp_to_right(

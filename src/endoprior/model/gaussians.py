@@ -145,7 +145,7 @@ class Gaussians:
         """Activate the parameters, moved by `offsets` (None: canonical), with color up to `sh_degree`.
 
         Args:
-            right_share: how far the color is that of the right eye, in [0, 1]: see `stereo_order.share_of_right`.
+            right_share: how far the color is that of the right eye, in [0, 1]: see `core.geometry.share_of_right`.
         """
         t = self.tensors
         sh_dc = t["sh_dc"]

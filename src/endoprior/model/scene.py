@@ -19,8 +19,8 @@ from torch import Tensor
 from .. import render
 from ..compute.parallel_kernels import demand_unforked
 from ..core.config import Config
+from ..core.geometry import share_of_right
 from ..core.types import Camera, RenderedView, Splats
-from ..footage.stereo_order import share_of_right
 from ..system.arrays_file import part, save_arrays
 from .blending import Background, faded, joined, rendered, rendered_many
 from .gaussians import Gaussians
