@@ -107,6 +107,19 @@ def test_a_method_of_another_package_needs_public_names_only():
                     assert name in public, f"{path}:{node.lineno}: {name} stands on no page for plugins"
 
 
+def test_modules_of_compute_serve_several_packages():
+    """What one package uses belongs into that package; `lane_types` is a part of `simd`."""
+    users: dict[str, set[str]] = {path.stem: set() for path in (SRC / "compute").glob("[!_]*.py")}
+    for path in ALL_FILES:
+        parts = path.relative_to(ROOT / "src").parts
+        package = parts[1] if parts[0] == "endoprior" else parts[0]
+        for node in nodes(path):
+            module = node.module or "" if isinstance(node, ast.ImportFrom) else ""
+            if found := re.search(r"\bcompute\.(\w+)", module):
+                users[found[1]].add(package)
+    assert {name for name, packages in users.items() if len(packages) < 2} == {"lane_types"}
+
+
 def circles(types: bool) -> list[set[str]]:
     """The modules that import one another in circles, by circle; with imports for type checking if `types` says so."""
     names = {path.relative_to(SRC).with_suffix("").parts: path for path in FILES}
