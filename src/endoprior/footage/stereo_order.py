@@ -19,6 +19,7 @@ from ..core.checks import check_shape
 from ..core.geometry import bilinear, pixel_centers, right_camera
 from ..core.types import Frame
 from .components import Image, Mask
+from .keypoints import alike, keypoints
 
 SMALL_STEP, LARGE_STEP = 16, 64
 """Penalty per block pixel for a disparity change of one px between neighbors, and for a larger change."""
@@ -122,15 +123,11 @@ def vertical_offset_px(left_u8: Image, right_u8: Image) -> float:
 
 def row_offsets_px(left_u8: Image, right_u8: Image) -> NDArray[np.float64]:
     """(N,) y_right - y_left of each matching feature, px; arguments as for `vertical_offset_px`."""
-    finder, whole = cv2.SIFT.create(FEATURES), np.empty(0, np.uint8)
-    (left, left_marks), (right, right_marks) = (
-        finder.detectAndCompute(camera, whole) for camera in _gray(left_u8, right_u8)
-    )
+    (left, left_like), (right, right_like) = (keypoints(camera, FEATURES) for camera in _gray(left_u8, right_u8))
     if min(len(left), len(right)) < FEWEST_MATCHES:
         return np.zeros(0)
-    pairs = cv2.BFMatcher().knnMatch(left_marks, right_marks, k=2)
-    good = [best for best, second in pairs if best.distance < RATIO * second.distance]
-    return np.array([right[m.trainIdx].pt[1] - left[m.queryIdx].pt[1] for m in good])
+    of_left, of_right = alike(left_like, right_like, RATIO)
+    return right[of_right, 1].astype(np.float64) - left[of_left, 1]
 
 
 def _gray(left_u8: Image, right_u8: Image) -> list[Image]:
