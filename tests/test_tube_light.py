@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from endoprior.prepare.camera_path import tube
-from endoprior.prepare.camera_path.shape import MOST_RATIO, axial_cosine
+from endoprior.prepare.camera_path.path_facts import MOST_RATIO
+from endoprior.prepare.camera_path.shape import axial_cosine
 from endoprior.prepare.camera_path.tracks import Lens, PoseInput
 from endoprior.prepare.camera_path.tube import shape_by_light
 from endoprior.prepare.relative_depth import fit_shading
