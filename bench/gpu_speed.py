@@ -18,7 +18,7 @@ from endoprior import render
 from endoprior.core.types import Camera, Splats
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import SingleScene
 
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
 PRESETS = ("default", "paper")

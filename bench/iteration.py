@@ -20,7 +20,7 @@ from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.render import numba as numba_backend
-from endoprior.training import gaussian_method, local_motion, temporal
+from endoprior.training import gaussian_hooks, local_motion, temporal
 from endoprior.training import step as iteration_module
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
@@ -40,7 +40,7 @@ PARTS = {
     "projection + SH": [(numba_backend, "project_forward")],
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],
-    "losses": [(gaussian_method, "supervised_terms")],
+    "losses": [(gaussian_hooks, "supervised_terms")],
     "temporal term": [
         (temporal, "choose"),
         *((local_motion, f"{n}_numba") for n in ("neighbors", "affinity", "local_motion")),

@@ -10,17 +10,17 @@ import numpy as np
 import scenes
 import torch
 
+from endoprior.compute.relu_network import relu_network, relu_network_torch
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.basis import TRAINED, basis_offsets
 from endoprior.model.gaussians import temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField
-from endoprior.model.motion import RankOneGradient
+from endoprior.model.offsets import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer, rate_of, temporal_rates
 from endoprior.training.temporal import MOST_POINTS
-from endoprior_baselines.relu_network import relu_network, relu_network_torch
 from endoprior_baselines.surgicalgaussian import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
 TIME, RATE, EPSILON = 0.4, 1e-3, 1e-15

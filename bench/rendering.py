@@ -16,7 +16,7 @@ from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
 from endoprior.model.ops import TORCH
 from endoprior.model.playback import Playback
 from endoprior.model.presets import preset
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import SingleScene
 from endoprior.render import numba as numba_backend
 from endoprior.render.autograd import Project
 from endoprior.render.numba import KERNELS

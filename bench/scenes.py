@@ -12,7 +12,7 @@ from endoprior.core.config import Config
 from endoprior.core.types import Camera, Splats
 from endoprior.model.gaussians import Gaussians, temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import SingleScene
 
 FOCAL_PER_WIDTH = 0.9
 """Of an endoscope; also the phantom's."""

@@ -4,7 +4,8 @@ from torch import Tensor
 
 from endoprior.core.config import Config
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Field, Motion, Offsets
+from endoprior.model.motion import Field, Motion
+from endoprior.model.offsets import Offsets
 from endoprior.model.ops import ModelOps
 from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod

@@ -10,10 +10,9 @@ import torch
 
 from endoprior.cli import main
 from endoprior.core.types import Camera, Splats
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 
 NUM_FRAMES = 10
 

@@ -10,8 +10,8 @@ import torch
 
 from endoprior.core.config import Config
 from endoprior.data import FrameSequence
+from endoprior.model.scene import SingleScene
 from endoprior.model.scene_file import load_scene
-from endoprior.model.single_scene import SingleScene
 from endoprior.runs.train import train
 from endoprior.training.trainer import Stage
 

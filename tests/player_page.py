@@ -19,11 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from endoprior.core.types import Camera
 from endoprior.export.html import CHANNELS
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model import scene as scenes
-from endoprior.model.gaussians import create_gaussians
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 
 WIDTH, HEIGHT, RATE = 320, 256, 10.0
 

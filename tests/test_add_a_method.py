@@ -27,7 +27,6 @@ from endoprior.evaluation.scoring import evaluate
 from endoprior.model.method import METHODS, config_from, method_named, method_of
 from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import load_scene
-from endoprior.model.single_scene import SCENE_FORMAT
 from endoprior.runs.train import train
 from endoprior.system.arrays_file import save_arrays
 from endoprior_studies.spec_file import load_spec

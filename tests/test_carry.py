@@ -11,11 +11,11 @@ from export_scenes import moving_scene
 from hexplane_grids import planes
 
 from endoprior.core.geometry import project
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.carry import NUM_CARRIERS, carry, carry_points
-from endoprior.model.gaussians import create_gaussians
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import SingleScene
 from endoprior.model.surface import depth_at, project_visible, render_surface, shown_pixels, surface_points
 from endoprior.model.uncertainty import point_errors
 

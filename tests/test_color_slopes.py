@@ -11,8 +11,9 @@ from export_scenes import moving_scene
 from render_scenes import camera, one
 
 from endoprior import render
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.colors import FEW_ITERATIONS, one_color
-from endoprior.model.gaussians import SH_C0, attribute_shapes, create_gaussians, with_colors
+from endoprior.model.gaussians import SH_C0, attribute_shapes, with_colors
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.render.constants import BLUR_PX2

@@ -9,7 +9,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.core.types import Camera, Frame, RenderOutput
 from endoprior.data import load_sequence
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, adam_unstored_step
 from endoprior.training.adam import adam_step_numba as adam_step

@@ -10,7 +10,7 @@ import torch
 from endoprior.compute.morton import morton_order
 from endoprior.core.config import ReleasedMethod
 from endoprior.core.types import RenderOutput
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.presets import preset
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan, apply_plan, split_children

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.types import RenderOutput, Splats
 from endoprior.data import load_sequence
-from endoprior.model.gaussians import SH_C0, create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
+from endoprior.model.gaussians import SH_C0
 from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training.density import DensityStats

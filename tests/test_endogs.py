@@ -11,13 +11,13 @@ from method_runs import trained_and_resumed
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, PlaneGrid
 from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
-from endoprior.training.gaussian_method import in_epochs
+from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.state import Drawn

@@ -14,11 +14,10 @@ from hexplane_grids import planes
 
 from endoprior.export.axes import ROTATIONS
 from endoprior.export.formats import FORMATS
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 
 DOCS = Path(__file__).parents[1] / "docs"
 TIMES = (0.0, 0.13, 0.5, 0.99, 1.0)

@@ -17,10 +17,9 @@ from plugin_packages import entry_points, write_package
 
 import endoprior
 from endoprior.data import load_sequence
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 
 SOURCES, DOCS = Path(endoprior.__file__).parents[1], Path(__file__).parents[1] / "docs"
 EXAMPLE = DOCS.parent / "examples" / "endoprior_example" / "endoprior_example"
@@ -32,7 +31,7 @@ from endoprior import evaluate, load_scene, load_sequence
 from endoprior_studies.results import Results
 from endoprior_studies.spec import Cell, MethodSpec, SequenceSpec, Spec
 from endoprior_studies.tables import markdown, score_table
-from endoprior.model.motion import Offsets
+from endoprior.model.offsets import Offsets
 
 
 class Static:

@@ -14,12 +14,12 @@ from endoprior.data import FrameSequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.score import ScoreUnavailable
 from endoprior.evaluation.scorers import motion
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.basis import spline_weights
 from endoprior.model.colors import with_fixed_color
-from endoprior.model.gaussians import Gaussians, change_layout, create_gaussians
+from endoprior.model.gaussians import Gaussians, change_layout
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 from endoprior.visualization.tissue_layers import SQUARES, PaintedTissue
 
 WIDTH, HEIGHT, FOCAL, DEPTH, NUM_FRAMES = 160, 96, 200.0, 60.0, 10

@@ -12,10 +12,10 @@ from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig
 from endoprior.core.geometry import back_project, pixel_centers, quaternion_to_matrix
 from endoprior.core.types import Camera, Frame
-from endoprior.initialization.first_gaussians import first_gaussians, flat_along, surface_normals
+from endoprior.initialization.first_gaussians import create_gaussians, first_gaussians, flat_along, surface_normals
 from endoprior.initialization.sampling import PointCloud
 from endoprior.model.basis import basis_offsets, spline_weights
-from endoprior.model.gaussians import create_gaussians, temporal_shapes
+from endoprior.model.gaussians import temporal_shapes
 from endoprior.model.ops import NUMBA
 from endoprior.model.presets import preset
 from endoprior.training.step import MAX_SCALE_SHARE, largest_share, limit_scales

@@ -12,9 +12,9 @@ from method_runs import trained_and_resumed
 from tiny_training import tiny_config
 
 from endoprior import preset, train
+from endoprior.core.geometry import right_camera, share_of_right
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
-from endoprior.footage.stereo_order import right_camera, share_of_right
 from endoprior.model.colors import with_fixed_color
 from endoprior.model.gaussians import Gaussians, change_layout
 from endoprior.model.highlights import without_highlights

@@ -14,11 +14,11 @@ from endoprior.core.checks import InputError
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project
 from endoprior.core.types import Camera, Frame
-from endoprior.model.gaussians import SH_C0, change_layout, create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
+from endoprior.model.gaussians import SH_C0, change_layout
 from endoprior.model.highlights import without_highlights
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 
 WIDTH, HEIGHT, NUM_FRAMES, NUM_BASES = 96, 64, 24, 17
 CAMERA = Camera(WIDTH, HEIGHT, 120.0, 120.0, WIDTH / 2, HEIGHT / 2, np.eye(4))

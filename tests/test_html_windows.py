@@ -14,7 +14,7 @@ from player_page import RATE, WIDTH, open_player, picture, random_scene, rendere
 from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
 from endoprior.export.html import PageTooLarge, quantized_blocks, write_html
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import SingleScene
 from endoprior.model.windowed_scene import Span, WindowedScene
 
 SPANS = (Span(0, 7, 900), Span(4, 11, 1100), Span(8, 15, 700), Span(12, 20, 1000))

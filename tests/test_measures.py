@@ -13,7 +13,7 @@ from export_scenes import plane_camera
 from plyfile import PlyData
 
 from endoprior.cli import main
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.measures import (
     SurfaceMotion,
     area,
@@ -26,8 +26,7 @@ from endoprior.model.measures import (
     smoothed,
 )
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 from endoprior.visualization.measures import displacement_span, measures_csv, stretch_span, value_colors
 
 

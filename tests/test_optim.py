@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from endoprior.core.config import OptimConfig
-from endoprior.model.gaussians import change_layout, create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
+from endoprior.model.gaussians import change_layout
 from endoprior.model.method import method_of
-from endoprior.model.motion import RankOneGradient
+from endoprior.model.offsets import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA

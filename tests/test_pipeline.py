@@ -22,8 +22,8 @@ from endoprior.data import load_sequence
 from endoprior.data.files import read_json
 from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
+from endoprior.model.scene import SingleScene
 from endoprior.model.scene_file import load_scene
-from endoprior.model.single_scene import SingleScene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline import (
     STEPS,

@@ -11,13 +11,13 @@ import torch
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Camera
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.carry import carry_points
-from endoprior.model.gaussians import Gaussians, create_gaussians
+from endoprior.model.gaussians import Gaussians
 from endoprior.model.playback import Playback
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
+from endoprior.model.scene import Scene, SingleScene
 from endoprior.model.scene_file import load_scene
-from endoprior.model.single_scene import SingleScene
 
 NUM_FRAMES = 5
 

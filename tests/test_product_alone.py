@@ -12,7 +12,8 @@ import endoprior
 
 ALONE = """
 import sys
-sys.modules["endoprior_baselines"] = sys.modules["endoprior_studies"] = None
+for name in ("baselines", "radiance", "studies"):
+    sys.modules[f"endoprior_{name}"] = None
 from endoprior.cli import main
 
 sys.exit(main(sys.argv[1:]))

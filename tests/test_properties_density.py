@@ -16,7 +16,7 @@ from hypothesis_profiles import examples
 
 from endoprior.core.config import DensityConfig, ReleasedMethod
 from endoprior.core.types import RenderOutput
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.presets import preset
 from endoprior.training import density
 from endoprior.training.density import DensityStats, apply_plan

@@ -7,13 +7,14 @@ import math
 import pytest
 import torch
 
-from endoprior_baselines.radiance import endosurf_networks
-from endoprior_baselines.radiance import presets as presets_radiance
-from endoprior_baselines.radiance.endonerf import CanonicalNetwork, EndoNeRF, TimeNetwork
-from endoprior_baselines.radiance.endosurf import EndoSurf, rounds_of
-from endoprior_baselines.radiance.endosurf_networks import ColorNetwork, DeformationNetwork, SurfaceNetwork
-from endoprior_baselines.radiance.layers import Linear, NormedLinear, encoded, encoded_change, encoded_size, start
-from endoprior_baselines.radiance.presets import RadianceConfig
+from endoprior.compute.frequency_encoding import encoded, encoded_size
+from endoprior_radiance import endosurf_networks
+from endoprior_radiance import presets as presets_radiance
+from endoprior_radiance.endonerf import CanonicalNetwork, EndoNeRF, TimeNetwork
+from endoprior_radiance.endosurf import EndoSurf, rounds_of
+from endoprior_radiance.endosurf_networks import ColorNetwork, DeformationNetwork, SurfaceNetwork
+from endoprior_radiance.layers import Linear, NormedLinear, encoded_change, start
+from endoprior_radiance.presets import RadianceConfig
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -9,9 +9,9 @@ from render_scenes import camera as some_camera
 
 from endoprior.core.geometry import pixel_centers, project
 from endoprior.core.types import Camera
-from endoprior_baselines.radiance import endonerf, endosurf
-from endoprior_baselines.radiance.endosurf import first_crossing
-from endoprior_baselines.radiance.rays import (
+from endoprior_radiance import endonerf, endosurf
+from endoprior_radiance.endosurf import first_crossing
+from endoprior_radiance.rays import (
     Composited,
     all_rays,
     by_weight,
@@ -26,7 +26,7 @@ from endoprior_baselines.radiance.rays import (
     surface_places,
     to_perspective,
 )
-from endoprior_baselines.radiance.trainer import due, refined
+from endoprior_radiance.trainer import due, refined
 
 
 def test_rays_pass_the_pixel_centers():

@@ -28,12 +28,12 @@ from endoprior.system.arrays_file import load_arrays, save_arrays
 from endoprior.training import divergence
 from endoprior.training.divergence import Diverged
 from endoprior.training.trainer import Stage
-from endoprior_baselines.radiance import presets as presets_radiance
-from endoprior_baselines.radiance.endonerf import EndoNeRF, depth_spread
-from endoprior_baselines.radiance.endosurf import EndoSurf, enclosing_sphere, without_outliers
-from endoprior_baselines.radiance.rays import RayFrames, measured
-from endoprior_baselines.radiance.scene import RadianceScene
-from endoprior_baselines.radiance.trainer import RadianceTrainer
+from endoprior_radiance import presets as presets_radiance
+from endoprior_radiance.endonerf import EndoNeRF, depth_spread
+from endoprior_radiance.endosurf import EndoSurf, enclosing_sphere, without_outliers
+from endoprior_radiance.rays import RayFrames, measured
+from endoprior_radiance.scene import RadianceScene
+from endoprior_radiance.trainer import RadianceTrainer
 
 FIELDS = {"endonerf": EndoNeRF, "endosurf": EndoSurf}
 NAMES = tuple(FIELDS)
@@ -208,7 +208,7 @@ def test_scene_from_its_file_renders_alike(
     assert a.color.shape == (8, 10, 3) and a.depth.shape == a.alpha.shape == (8, 10)
     assert torch.equal(a.color, b.color) and torch.equal(a.depth, b.depth) and torch.equal(a.alpha, b.alpha)
     assert float(a.color.min()) >= 0 and float(a.color.max()) <= 1 and not a.color.requires_grad
-    monkeypatch.setattr("endoprior_baselines.radiance.scene.SAMPLES_AT_ONCE", {"cpu": 100})  # 8 rays at a time
+    monkeypatch.setattr("endoprior_radiance.scene.SAMPLES_AT_ONCE", {"cpu": 100})  # 8 rays at a time
     torch.testing.assert_close(loaded.render(0.4).color, a.color)
     assert loaded.to("cpu") is loaded and loaded.frames_per_second == 15
     with pytest.raises(ValueError, match="time must be"):

@@ -90,7 +90,7 @@ def names(wheel: Path) -> list[str]:
 
 def test_the_wheel_holds_the_whole_package_and_its_documentation(checkout, built, commit):
     found = {name for name in names(next(built.glob("*.whl"))) if ".dist-info/" not in name}
-    sources = ("endoprior", "endoprior_baselines", "endoprior_studies")
+    sources = ("endoprior", "endoprior_baselines", "endoprior_radiance", "endoprior_studies")
     files = (path for name in sources for path in (ROOT / "src" / name).rglob("*") if path.is_file())
     package = {path.relative_to(ROOT / "src") for path in files}
     pages = {Path("endoprior") / path.relative_to(ROOT) for path in (ROOT / "docs").rglob("*") if path.is_file()}

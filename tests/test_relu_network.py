@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from endoprior_baselines import relu_network as module
-from endoprior_baselines.relu_network import relu_network, relu_network_torch
+from endoprior.compute import relu_network as module
+from endoprior.compute.relu_network import relu_network, relu_network_torch
 
 INPUTS, WIDTH, OUTPUTS, REPEATED = 5, 7, 3, 4
 SKIPS = pytest.mark.parametrize("skip", [-1, 1, 2, 3], ids=lambda skip: f"skip {skip}")

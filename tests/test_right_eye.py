@@ -13,12 +13,12 @@ from tiny_training import losses_of, tiny_config
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
-from endoprior.core.geometry import back_project, project
+from endoprior.core.geometry import back_project, project, right_camera
 from endoprior.core.types import Camera, RenderedView
 from endoprior.data import load_sequence
 from endoprior.evaluation.context import NO_SCENE, Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.scorers import other_views
-from endoprior.footage.stereo_order import NEAREST, measured_disparity, right_camera, right_disparity, warp_to_right
+from endoprior.footage.stereo_order import NEAREST, measured_disparity, right_disparity, warp_to_right
 from endoprior.phantom import PhantomConfig, write_phantom
 
 BASELINE = 4.0

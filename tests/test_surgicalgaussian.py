@@ -13,7 +13,7 @@ from endoprior.core.config import DataConfig
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.evaluation.scorers import image as metrics
-from endoprior.model.gaussians import create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.presets import preset
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames

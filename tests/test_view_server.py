@@ -22,10 +22,10 @@ from endoprior.cli.view import live_view, open_viewable
 from endoprior.core.config import Config
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
-from endoprior.model.gaussians import Gaussians, create_gaussians
+from endoprior.initialization.first_gaussians import create_gaussians
+from endoprior.model.gaussians import Gaussians
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene
-from endoprior.model.single_scene import SingleScene
+from endoprior.model.scene import Scene, SingleScene
 from endoprior.runs.train import train
 from endoprior.view import live
 from endoprior.view.measure import DrawnTracks

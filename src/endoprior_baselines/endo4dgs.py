@@ -22,7 +22,7 @@ from endoprior.model.gaussians import SH_C0, Gaussians
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
 from endoprior.render.projection import rotation_matrices
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
-from endoprior.training.gaussian_method import in_epochs
+from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate, rate_of

@@ -18,15 +18,17 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, huber_loss, relu
 from typing_extensions import override
 
+from endoprior.compute.relu_network import relu_network
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion, LinearLayers, num_features
-from endoprior.model.motion import Field, Offsets
+from endoprior.model.motion import Field
+from endoprior.model.offsets import Offsets
 from endoprior.model.ops import ModelOps
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.frames import TrainingFrames
-from endoprior.training.gaussian_method import in_epochs
+from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
@@ -34,7 +36,6 @@ from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
-from .relu_network import relu_network
 from .surface_points import Released
 
 UNIT_MM = 10.0

@@ -20,26 +20,27 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d, normalize
 from typing_extensions import override
 
+from endoprior.compute.frequency_encoding import encoded, encoded_size
 from endoprior.compute.neighbors import nearest
+from endoprior.compute.relu_network import relu_network
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Frame, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Field, Motion, Offsets
+from endoprior.model.motion import Field, Motion
+from endoprior.model.offsets import Offsets
 from endoprior.model.ops import ModelOps
 from endoprior.render.projection import rotation_matrices
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan
-from endoprior.training.gaussian_method import in_epochs
+from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_linear, rate_of
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
-from .radiance.layers import encoded, encoded_size
-from .relu_network import relu_network
 from .surface_points import Released, grid_points
 
 PLACE_BANDS, TIME_BANDS = 10, 4

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from endoprior.core.checks import input_error
 from endoprior.core.config import OWN, Config
-from endoprior.model.method import METHODS, Method
+from endoprior.model.method import METHODS, SceneKind
 from endoprior.model.presets import PRESETS, preset, preset_names
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def method_named(name: str) -> BenchMethod:
     if name in preset_names():
         return PresetMethod(preset(name))
     found = METHODS.load(name)
-    if isinstance(found, Method):
+    if isinstance(found, SceneKind):
         raise input_error(f"method {name}", "a preset of its name", "none", "Add one: docs/plugins.md.")
     return found
 

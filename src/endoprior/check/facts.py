@@ -17,8 +17,8 @@ from ..core.ranges import evenly_spaced
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.contents import overexposed
+from ..data.formats import needs_depth
 from ..data.found_tools import UNCERTAIN, read_rows
-from ..data.image_folders import needs_depth
 from ..data.pixels import measured_share
 from ..data.scale import Scale
 from ..data.window_plan import look_through, plan_windows

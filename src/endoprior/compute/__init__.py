@@ -1,1 +1,1 @@
-"""How arithmetic runs on the CPU: vector types for Numba, Morton order, neighbor search, the choice of kernels."""
+"""How arithmetic runs on the CPU: vector types for Numba, Morton order, neighbor search, small networks, kernels."""

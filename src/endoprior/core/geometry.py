@@ -1,4 +1,4 @@
-"""Pinhole geometry on NumPy arrays: pixel grids, projection, back-projection, bilinear look-up.
+"""Pinhole geometry on NumPy arrays: pixel grids, projection, back-projection, a stereo pair, bilinear look-up.
 
 Pixel (0, 0) is centered at (0.5, 0.5); `x = fx X / Z + cx`. Everything is in mm and px.
 """
@@ -6,6 +6,7 @@ Pixel (0, 0) is centered at (0.5, 0.5); `x = fx X / Z + cx`. Everything is in mm
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -67,6 +68,19 @@ def back_project(pixels: NDArray, depth: NDArray, camera: Camera) -> NDArray:
         -1,
     )
     return (in_camera - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+
+
+def right_camera(camera: Camera, baseline_mm: float) -> Camera:
+    """The camera that stands `baseline_mm` along the +x axis of `camera`, with its lens and turned like it."""
+    moved = np.eye(4)
+    moved[0, 3] = -baseline_mm
+    return replace(camera, world_to_camera=moved @ camera.world_to_camera)
+
+
+def share_of_right(camera: Camera, left: Camera, baseline_mm: float) -> float:
+    """How much `camera` sees as the right camera does: 1 there, falls linearly to 0 at the distance of the left one."""
+    away = np.linalg.norm(camera.center - right_camera(left, baseline_mm).center)
+    return float(max(0, 1 - away / baseline_mm))
 
 
 def expected_depth(depth: NDArray, alpha: NDArray, min_alpha: float = 0.5) -> NDArray[np.float32]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,15 +16,9 @@ from ..core.checks import input_error
 from ..core.types import Frame
 from ..footage.components import Image, Mask, square
 from ..footage.dark_outline import brightness
-from ..system.memory import workers
 from .image_folders import has_depth, how_to_add_depth
 from .reading import reading
 
-if TYPE_CHECKING:
-    from .sequence import FrameSequence
-
-DECODING_BYTES = 40  # memory per pixel while a frame is read
-TOOL_FRACTION_WARNING = 0.6  # with a larger share of tool pixels, the mask is probably inverted
 State = tuple[int, int, int] | None
 
 
@@ -56,47 +49,48 @@ def fingerprint_of(files: Sequence[Path], folder: Path) -> str:
     return digest.hexdigest()
 
 
-def remarks_on(sequence: FrameSequence, decoded: Callable[[int], Frame]) -> list[str]:
-    """What is unusual but usable in the frames, one line each; InputError if they cannot be trained on."""
+class FrameContents(NamedTuple):
+    """What of a frame can be trained on."""
 
-    def contents(index: int) -> tuple[float, bool, int, int]:
-        """Share of tissue; whether any pixel has depth; how many tissue pixels have depth, and a color besides."""
-        frame = decoded(index)
-        measured = frame.depth_valid & frame.tissue_mask
-        colored = measured & ~is_saturated(frame.rgb_u8)
-        num_measured, num_colored = int(np.count_nonzero(measured)), int(np.count_nonzero(colored))
-        return float(frame.tissue_mask.mean()), bool(frame.depth_valid.any()), num_measured, num_colored
+    tissue: float  # its share of the pixels
+    has_depth: bool  # anywhere, on tools too
+    num_measured: int  # tissue pixels with depth
+    num_colored: int  # those of them whose color is not saturated
 
-    camera, count = sequence.camera(0), len(sequence)
-    masks, depth = sequence.path / sequence.mask_name, sequence.path / "depth"
-    with ThreadPoolExecutor(workers(DECODING_BYTES * camera.width * camera.height)) as pool:
-        # Decoding releases the interpreter lock.
-        tissue, with_depth, with_both, colored = zip(*pool.map(contents, range(count)), strict=True)
-    if not any(tissue):
+
+def frame_contents(frame: Frame) -> FrameContents:
+    """What of a frame can be trained on."""
+    measured = frame.depth_valid & frame.tissue_mask
+    colored = measured & ~is_saturated(frame.rgb_u8)
+    num_measured, num_colored = int(np.count_nonzero(measured)), int(np.count_nonzero(colored))
+    return FrameContents(float(frame.tissue_mask.mean()), bool(frame.depth_valid.any()), num_measured, num_colored)
+
+
+def demand_trainable(
+    frames: Sequence[FrameContents], train: Sequence[int], path: Path, mask_name: str, *, is_plain: bool
+) -> None:
+    """Raise InputError if the frames of a sequence cannot be trained on.
+
+    Args:
+        train: indices of the training frames. path: folder of the sequence. mask_name: of the folder of masks in it.
+        is_plain: whether the folder has the layout `plain`, which images without depth have, too.
+    """
+    masks, depth = path / mask_name, path / "depth"
+    if not any(frame.tissue for frame in frames):
         hint = "the polarity may be inverted: masks are 255 on tools."
         raise input_error(masks, "tissue in at least one frame", "tool everywhere", hint)
-    if not any(with_depth):
-        got = "0 everywhere" if has_depth(sequence.path) else "none"
-        raise input_error(depth, "depth > 0 in at least one frame", got, how_to_add_depth(sequence.path))
-    train = sequence.indices("train")
-    if not any(with_both[index] for index in train):
+    if not any(frame.has_depth for frame in frames):
+        got = "0 everywhere" if has_depth(path) else "none"
+        fix = how_to_add_depth(path, is_plain=is_plain)
+        raise input_error(depth, "depth > 0 in at least one frame", got, fix)
+    if not any(frames[index].num_measured for index in train):
         hint = "the mask's polarity may be inverted, or the depth may be of the tool only."
         raise input_error(depth, "depth on tissue in a training frame", "none", hint)
-    share = sum(colored[index] for index in train) / sum(with_both[index] for index in train)
+    share = sum(frames[index].num_colored for index in train) / sum(frames[index].num_measured for index in train)
     if share < LEAST_COLORED:
         want = f"a level below {SATURATED} of 255 on at least {LEAST_COLORED:.0%} of the tissue in the training frames"
         hint = "export the images again, with all values from 0 to 255 in use, or choose a darker part of the video."
-        raise input_error(sequence.path, want, f"{share:.1%}: the images are white", hint)
-    remarks = list(sequence.remarks)
-    if (tool := 1 - sum(tissue) / count) > TOOL_FRACTION_WARNING:
-        remarks.append(f"{masks}: {tool:.0%} of all pixels are masked; the polarity may be inverted")
-    if sequence.depth_is_relative:
-        remarks.append(f"{sequence.path}: the scale of its depth is unknown or assumed; lengths are not millimeters")
-    if sequence.scale is not None:
-        remarks.append(f"{sequence.path}: scale by {sequence.scale.text}")
-    if empty := [index for index in range(count) if not with_both[index]]:
-        remarks.append(f"{sequence.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
-    return remarks
+        raise input_error(path, want, f"{share:.1%}: the images are white", hint)
 
 
 SATURATED = 250  # a pixel is saturated if its smallest channel reaches this level: its color is at least as bright

@@ -9,13 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..core.config import DataConfig
 from ..system.plugins import Registry, report
-
-if TYPE_CHECKING:
-    from .sequence import FrameSequence
+from .image_folders import has_depth
+from .sequence import FrameSequence
 
 FORMATS = (
     "scared",
@@ -74,3 +73,8 @@ def recognizing(path: Path) -> str | None:
         except Exception as error:  # a plugin's fault must not keep other folders from opening
             report(REGISTRY.failure(name, error))
     return FORMATS[-1] if REGISTRY.load(FORMATS[-1]).recognizes(path) else None
+
+
+def needs_depth(folder: Path) -> bool:
+    """Whether a folder has images, and neither depth nor poses: `prepare` makes a sequence of it."""
+    return recognizing(folder) == "plain" and not has_depth(folder)

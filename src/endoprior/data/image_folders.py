@@ -14,7 +14,6 @@ from ..core.checks import input_error
 from ..core.shell import command, quoted
 from .description import read_description
 from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, entries, in_order, words_of
-from .formats import recognizing
 from .images import DEPTH_SUFFIXES
 from .poses import MATRIX_FILE
 from .reading import kind_of
@@ -70,14 +69,9 @@ def is_footage(folder: Path) -> bool:
     return contents_of(folder) is not None and not any(_is_of(each, DEPTH_WORDS) for each in _folders(folder))
 
 
-def needs_depth(folder: Path) -> bool:
-    """Whether a folder has images, and neither depth nor poses: `prepare` makes a sequence of it."""
-    return recognizing(folder) == "plain" and not has_depth(folder)
-
-
-def how_to_add_depth(folder: Path) -> str:
-    """What gives depth to a sequence folder that has none anywhere."""
-    if needs_depth(folder):
+def how_to_add_depth(folder: Path, *, is_plain: bool) -> str:
+    """What gives depth to a sequence folder that has none anywhere; `is_plain`: of the layout `plain`."""
+    if is_plain and not has_depth(folder):
         return f"{ways_to_prepare(folder)}."
     if has_depth(folder):
         return "provide depth in mm, 0 where it is missing."

@@ -17,14 +17,12 @@ from ..core.config import DataConfig
 from ..core.shell import command, quoted
 from .endonerf import load_endonerf
 from .files import entries, or_neighbor, read_json
-from .formats import REGISTRY, recognizing
+from .formats import REGISTRY, needs_depth, recognizing
 from .image_folders import (
     beside,
     contents_of,
-    how_to_add_depth,
     image_folders,
     is_footage,
-    needs_depth,
     ways_to_prepare,
 )
 from .reading import kind_of
@@ -86,7 +84,8 @@ def load_sequence(
             raise input_error("data.window", expected, cfg.window, "correct it, or leave it out for all frames.")
         sequence = sequence.part(frames[0], frames[-1] + 1)
     _use_reliability(sequence, cfg)
-    sequence.reading, sequence.read_again = cfg, partial(load_sequence, path, pose_axes=pose_axes)
+    sequence.layout, sequence.reading = name, cfg
+    sequence.read_again = partial(load_sequence, path, pose_axes=pose_axes)
     return sequence
 
 
@@ -168,7 +167,7 @@ def not_a_sequence(path: Path) -> InputError | None:
 def not_trainable(path: Path) -> InputError | None:
     """The error for footage that is to be prepared first, and what else leads to a sequence folder; None for others."""
     if is_sequence(path) and needs_depth(path):
-        return input_error(path, "a sequence folder", "images without depth", how_to_add_depth(path))
+        return input_error(path, "a sequence folder", "images without depth", f"{ways_to_prepare(path)}.")
     return None if is_sequence(path) else not_a_sequence(path)
 
 

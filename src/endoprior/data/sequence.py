@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from pathlib import Path
@@ -18,14 +19,16 @@ from ..core.checks import input_error, number_ranges
 from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..footage.stereo_order import right_frame
-from ..system.memory import BoundedCache, cache_bytes
-from .contents import demand_same, fingerprint_of, remarks_on, state_of, weighted
+from ..system.memory import BoundedCache, cache_bytes, workers
+from .contents import demand_same, demand_trainable, fingerprint_of, frame_contents, state_of, weighted
 from .description import ESTIMATED_POSES, TOOLS_FOUND
 from .scale import Scale
 from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]
 TEST_EVERY = 8
+DECODING_BYTES = 40  # memory per pixel while a frame is read
+TOOL_FRACTION_WARNING = 0.6  # with a larger share of tool pixels, the mask is probably inverted
 
 
 def is_test_frame(index: int, phase: int = 0) -> bool:
@@ -89,6 +92,8 @@ class FrameSequence:
     frame_weights: NDArray[np.float64] | None = None
     """(T,) in [0, 1]: how far each frame is to be believed. One of weight 0, such as without a camera pose, is neither
     trained on nor scored. None: all alike (`data.reliability ignored`)."""
+    layout: str = ""
+    """Name of the layout of its folder, as `load_sequence` recognized it or was told; empty otherwise."""
     reading: DataConfig | None = None
     """How `load_sequence` read it; None for a sequence that was made in another way."""
     read_again: Callable[[DataConfig], FrameSequence] | None = None
@@ -324,7 +329,23 @@ class FrameSequence:
         Raises:
             InputError: a file cannot be used, or no frame has tissue, or no tissue pixel has depth.
         """
-        return remarks_on(self, self._decoded)
+        camera, count = self.camera(0), len(self)
+        with ThreadPoolExecutor(workers(DECODING_BYTES * camera.width * camera.height)) as pool:
+            # Decoding releases the interpreter lock.
+            frames = list(pool.map(lambda index: frame_contents(self._decoded(index)), range(count)))
+        is_plain = self.layout == "plain"
+        demand_trainable(frames, self.indices("train"), self.path, self.mask_name, is_plain=is_plain)
+        remarks = list(self.remarks)
+        if (tool := 1 - sum(frame.tissue for frame in frames) / count) > TOOL_FRACTION_WARNING:
+            masks = self.path / self.mask_name
+            remarks.append(f"{masks}: {tool:.0%} of all pixels are masked; the polarity may be inverted")
+        if self.depth_is_relative:
+            remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths are not millimeters")
+        if self.scale is not None:
+            remarks.append(f"{self.path}: scale by {self.scale.text}")
+        if empty := [index for index in range(count) if not frames[index].num_measured]:
+            remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
+        return remarks
 
 
 def _frame_bytes(frame: Frame) -> int:

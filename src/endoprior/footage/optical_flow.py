@@ -98,6 +98,27 @@ def follow_both_ways(
 
     Args:
         max_error_px: largest forward-backward error of x and of y, px; above it a pixel counts as lost.
+        side_px, halvings, guess, criteria: as of `follow_and_return`.
+    """
+    there, back, found = follow_and_return(
+        first, second, pixels, side_px=side_px, halvings=halvings, guess=guess, criteria=criteria
+    )
+    return there, found & (np.abs(back - pixels).max(1) < max_error_px)
+
+
+def follow_and_return(
+    first: Image,
+    second: Image,
+    pixels: NDArray[np.float32],
+    *,
+    side_px: int,
+    halvings: int,
+    guess: NDArray[np.float32] | None = None,
+    criteria: tuple[int, int, float] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+    """Where the second gray image shows pixels (N, 2) of the first, where the way back leads, and (N,) if both exist.
+
+    Args:
         side_px: side of the window that is compared.
         halvings: how often the images are halved; it bounds the motion that is found.
         guess: (N, 2) where to start in the second image; without it at `pixels`.
@@ -112,5 +133,4 @@ def follow_both_ways(
     there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, pixels, start, **options)
     home = None if guess is None else pixels + there - guess
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, home, **options)
-    kept = (found & found_back).ravel().astype(bool) & (np.abs(back - pixels).max(1) < max_error_px)
-    return there, kept
+    return there, back, (found & found_back).ravel().astype(bool)

@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .alignment import align
 from .components import Image, Mask
+from .keypoints import alike, keypoints
 from .optical_flow import follow_both_ways
 
 CORNERS, FEATURES = 200, 400  # most corners that are followed, and features that are compared, in an image
@@ -46,9 +47,7 @@ class ImageFeatures:
     def features(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(N, 2) px, and what each looks like, (N, 128)."""
         even = cv2.createCLAHE(2.0, (8, 8)).apply(self.gray)  # haze lowers contrast
-        points, like = cv2.SIFT.create(FEATURES, contrastThreshold=0.01).detectAndCompute(even, self._inside)
-        places = np.array([point.pt for point in points], np.float32).reshape(-1, 2)
-        return places, np.zeros((0, 128), np.float32) if like is None else np.asarray(like, np.float32)
+        return keypoints(np.asarray(even, np.uint8), FEATURES, self._inside, 0.01)
 
 
 class GlobalMotion(NamedTuple):
@@ -73,10 +72,8 @@ def feature_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | No
     (first, first_like), (second, second_like) = before.features, now.features
     if min(len(first), len(second)) < FEWEST:
         return None
-    pairs = [pair for pair in cv2.BFMatcher().knnMatch(first_like, second_like, k=2) if len(pair) == 2]
-    found = [best for best, other in pairs if best.distance < DISTINCT * other.distance]
-    a, b = first[[match.queryIdx for match in found]], second[[match.trainIdx for match in found]]
-    return _link(a, b, len(found), LIKE_PX, now.gray.shape[1])
+    here, there = alike(first_like, second_like, DISTINCT)
+    return _link(first[here], second[there], len(here), LIKE_PX, now.gray.shape[1])
 
 
 def _link(a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: float, width: int) -> GlobalMotion | None:

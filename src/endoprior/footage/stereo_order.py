@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape
-from ..core.geometry import bilinear, pixel_centers
-from ..core.types import Camera, Frame
+from ..core.geometry import bilinear, pixel_centers, right_camera
+from ..core.types import Frame
 from .components import Image, Mask
+from .keypoints import alike, keypoints
 
 SMALL_STEP, LARGE_STEP = 16, 64
 """Penalty per block pixel for a disparity change of one px between neighbors, and for a larger change."""
@@ -122,15 +123,11 @@ def vertical_offset_px(left_u8: Image, right_u8: Image) -> float:
 
 def row_offsets_px(left_u8: Image, right_u8: Image) -> NDArray[np.float64]:
     """(N,) y_right - y_left of each matching feature, px; arguments as for `vertical_offset_px`."""
-    finder, whole = cv2.SIFT.create(FEATURES), np.empty(0, np.uint8)
-    (left, left_marks), (right, right_marks) = (
-        finder.detectAndCompute(camera, whole) for camera in _gray(left_u8, right_u8)
-    )
+    (left, left_like), (right, right_like) = (keypoints(camera, FEATURES) for camera in _gray(left_u8, right_u8))
     if min(len(left), len(right)) < FEWEST_MATCHES:
         return np.zeros(0)
-    pairs = cv2.BFMatcher().knnMatch(left_marks, right_marks, k=2)
-    good = [best for best, second in pairs if best.distance < RATIO * second.distance]
-    return np.array([right[m.trainIdx].pt[1] - left[m.queryIdx].pt[1] for m in good])
+    of_left, of_right = alike(left_like, right_like, RATIO)
+    return right[of_right, 1].astype(np.float64) - left[of_left, 1]
 
 
 def _gray(left_u8: Image, right_u8: Image) -> list[Image]:
@@ -140,19 +137,6 @@ def _gray(left_u8: Image, right_u8: Image) -> list[Image]:
 
 STEEPEST = 1.0  # Neighbors of a row lie on one surface where their disparities differ by less than this, px per px
 NEAREST = 0.5  # A tool without depth may be as near as this share of the smallest measured depth of the frame
-
-
-def right_camera(camera: Camera, baseline_mm: float) -> Camera:
-    """The camera that stands `baseline_mm` along the +x axis of `camera`, with its lens and turned like it."""
-    moved = np.eye(4)
-    moved[0, 3] = -baseline_mm
-    return replace(camera, world_to_camera=moved @ camera.world_to_camera)
-
-
-def share_of_right(camera: Camera, left: Camera, baseline_mm: float) -> float:
-    """How much `camera` sees as the right camera does: 1 there, falls linearly to 0 at the distance of the left one."""
-    away = np.linalg.norm(camera.center - right_camera(left, baseline_mm).center)
-    return float(max(0, 1 - away / baseline_mm))
 
 
 def warp_to_right(

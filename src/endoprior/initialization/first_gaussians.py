@@ -12,12 +12,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..compute.morton import morton_order
 from ..core.config import Config
 from ..core.geometry import cells_at, project
 from ..core.types import Frame
+from ..model.gaussians import SH_C0, Gaussians, attribute_shapes
+from ..model.method import method_of
 from ..system.memory import workers
 from .flow_tracks import initial_motion
 from .motion_fit import InitialMotion
@@ -138,3 +141,36 @@ def first_gaussians(frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
         first.quats[:] = flat_along(surface_normals(cloud, frames))
         first.log_scales[:, 2] += np.float32(np.log(init.thickness))
     return first
+
+
+def create_gaussians(
+    points: NDArray,
+    colors: NDArray,
+    log_scales: NDArray,
+    cfg: Config,
+    quats: NDArray | None = None,
+    opacities: NDArray | None = None,
+) -> Gaussians:
+    """Gaussians at the initial points, of the points' color, at rest.
+
+    Args:
+        points: (N, 3) mm. colors: (N, 3) in [0, 1]. log_scales: (N,) for spheres or (N, 3), log of mm.
+        quats: (N, 4) wxyz; None: unrotated. opacities: (N,) in (0, 1); None: `cfg.init.opacity`.
+    Raises:
+        InputError: the config leaves the number of temporal basis functions open.
+    """
+    num = len(points)
+    log_scales = np.asarray(log_scales, np.float32)
+    log_scales = np.broadcast_to(log_scales[:, None] if log_scales.ndim == 1 else log_scales, (num, 3))
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (num, 1)) if quats is None else quats
+    chances = np.full(num, cfg.init.opacity) if opacities is None else np.asarray(opacities, np.float64)
+    tensors = {
+        "means": torch.from_numpy(np.ascontiguousarray(points, np.float32)),
+        "quats": torch.from_numpy(np.array(quats, np.float32)),
+        "log_scales": torch.from_numpy(np.array(log_scales)),
+        "opacity_logits": torch.from_numpy(np.log(chances / (1 - chances)).astype(np.float32)),
+        "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
+    }
+    # Everything else starts at zero: color that does not depend on the view, and is one in each Gaussian.
+    zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
+    return Gaussians(tensors | zeros | method_of(cfg).motion(cfg).first_tensors(num, cfg))

@@ -15,7 +15,7 @@ identity.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,13 +27,10 @@ from typing_extensions import override
 from ..core.checks import check_shape
 from ..core.config import Config
 from ..core.config_deformation import DEGREE, BasisConfig
-from .gaussians import change_layout, temporal_shapes
-from .motion import Field, Gradient, Motion, Offsets, RankOneGradient
-
-if TYPE_CHECKING:
-    from .gaussians import Gaussians
-    from .ops_interface import ModelOps
-
+from .gaussians import Gaussians, change_layout, temporal_shapes
+from .motion import Field, Motion
+from .offsets import Gradient, Offsets, RankOneGradient
+from .ops_interface import ModelOps
 
 TRAINED, GIVEN = ("motion", "changes"), ("frame_motion",)
 """Tensors of `temporal_shapes` that gradients train, as outer products; and those that optical flow gives."""

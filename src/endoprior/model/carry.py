@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ..core.types import Camera
 from .gaussians import Gaussians
-from .scene import Scene, Window
-from .single_scene import SingleScene
+from .scene import Scene, SingleScene, Window
 
 NUM_CARRIERS = 8
 """Gaussians that carry a point."""

@@ -22,8 +22,7 @@ from .. import render
 from ..core.types import Camera, Splats
 from .basis import spline_weights
 from .gaussians import SH_C0, Gaussians, change_layout
-from .scene import Scene, Window
-from .single_scene import SingleScene
+from .scene import Scene, SingleScene, Window
 
 
 def changes_color(scene: Scene) -> bool:

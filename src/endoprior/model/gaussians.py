@@ -3,16 +3,15 @@
 `N` Gaussians; every tensor's first axis is the Gaussian. Raw values are unconstrained: `exp` turns `log_scales` into
 mm, the logistic function turns `opacity_logits` into opacities. Shapes and temporal offsets follow `ATTRIBUTES`: to
 give Gaussians a new attribute, add a row there, its learning rate to `training.optimizer.RATES`, its starting value to
-`create_gaussians` and its use to `Gaussians.splats`. Files, checkpoints and density control need no change.
+`create_gaussians` in `initialization`, and its use to `Gaussians.splats`. Files, checkpoints and density control need
+no change.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -21,10 +20,7 @@ from ..core.checks import InputError
 from ..core.config import Config
 from ..core.config_deformation import DeformationConfig
 from ..core.types import Splats
-from .method import method_of
-
-if TYPE_CHECKING:
-    from .motion import Gradient, Offsets
+from .offsets import Gradient, Offsets
 
 
 @dataclass(frozen=True)
@@ -149,7 +145,7 @@ class Gaussians:
         """Activate the parameters, moved by `offsets` (None: canonical), with color up to `sh_degree`.
 
         Args:
-            right_share: how far the color is that of the right eye, in [0, 1]: see `stereo_order.share_of_right`.
+            right_share: how far the color is that of the right eye, in [0, 1]: see `core.geometry.share_of_right`.
         """
         t = self.tensors
         sh_dc = t["sh_dc"]
@@ -183,36 +179,3 @@ def with_colors(splats: Splats, colors: NDArray | Tensor) -> Splats:
     """The same Gaussians, each of one color, (N, 3): numbers to blend in its place, for example."""
     sh = (torch.as_tensor(colors).to(splats.sh)[:, None] - 0.5) / SH_C0
     return replace(splats, sh=sh.contiguous(), color_slopes=None)
-
-
-def create_gaussians(
-    points: NDArray,
-    colors: NDArray,
-    log_scales: NDArray,
-    cfg: Config,
-    quats: NDArray | None = None,
-    opacities: NDArray | None = None,
-) -> Gaussians:
-    """Gaussians at the initial points, of the points' color, at rest.
-
-    Args:
-        points: (N, 3) mm. colors: (N, 3) in [0, 1]. log_scales: (N,) for spheres or (N, 3), log of mm.
-        quats: (N, 4) wxyz; None: unrotated. opacities: (N,) in (0, 1); None: `cfg.init.opacity`.
-    Raises:
-        InputError: the config leaves the number of temporal basis functions open.
-    """
-    num = len(points)
-    log_scales = np.asarray(log_scales, np.float32)
-    log_scales = np.broadcast_to(log_scales[:, None] if log_scales.ndim == 1 else log_scales, (num, 3))
-    quats = np.tile([1.0, 0.0, 0.0, 0.0], (num, 1)) if quats is None else quats
-    chances = np.full(num, cfg.init.opacity) if opacities is None else np.asarray(opacities, np.float64)
-    tensors = {
-        "means": torch.from_numpy(np.ascontiguousarray(points, np.float32)),
-        "quats": torch.from_numpy(np.array(quats, np.float32)),
-        "log_scales": torch.from_numpy(np.array(log_scales)),
-        "opacity_logits": torch.from_numpy(np.log(chances / (1 - chances)).astype(np.float32)),
-        "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
-    }
-    # Everything else starts at zero: color that does not depend on the view, and is one in each Gaussian.
-    zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
-    return Gaussians(tensors | zeros | method_of(cfg).motion(cfg).first_tensors(num, cfg))

@@ -24,8 +24,7 @@ from ..priors.specular import specular_likelihood
 from .basis import spline_weights
 from .colors import changes_color
 from .gaussians import SH_C0, Gaussians, change_layout
-from .scene import Scene
-from .single_scene import SingleScene
+from .scene import Scene, SingleScene
 from .surface import FramesOf, project_visible, render_surface
 
 REACH_PX = 11

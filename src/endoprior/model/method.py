@@ -1,8 +1,7 @@
-"""What a method is: how it trains, what its scenes are made of, and which methods are installed.
+"""What the scenes of a method are made of, and which methods are installed; `training.method` adds how one trains.
 
-Reading frames, run folders, logs, checkpoints, scoring and rendering are the same for all. A method that consists of
-moving Gaussians is a `training.gaussian_method.GaussianMethod`. All methods, our own too, are entry points of the group
-`endoprior.methods` (docs/plugins.md), so that nothing here imports one.
+Reading frames, run folders, logs, checkpoints, scoring and rendering are the same for all. All methods, our own too,
+are entry points of the group `endoprior.methods` (docs/plugins.md), so that nothing here imports one.
 """
 
 from __future__ import annotations
@@ -11,27 +10,23 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
 from ..core.checks import input_error
 from ..core.config import OWN, Config
 from ..core.config_io import from_dict
+from ..core.types import Camera
 from ..system.arrays_file import ArraySpec
 from ..system.plugins import MissingPlugin, Registry
-
-if TYPE_CHECKING:
-    from ..core.types import Camera
-    from ..data import FrameSequence
-    from ..training.trainer import Trainer
-    from .motion import Motion
-    from .scene import RenderedScene
-    from .scene_facts import SceneFacts
+from .motion import Motion
+from .rendered_scene import RenderedScene
+from .scene_facts import SceneFacts
 
 
-class Method(ABC):
-    """One way from a sequence to a scene."""
+class SceneKind(ABC):
+    """What the scenes of a method are made of; a method is a `training.method.Method`."""
 
     background = (0.0, 0.0, 0.0)
     """Color behind everything, in [0, 1], in training and where its scenes are rendered."""
@@ -44,10 +39,6 @@ class Method(ABC):
 
     only: Mapping[str, Any] = {}
     """Fields of the config that it does not use, by dotted name, and their one value: others are rejected."""
-
-    @abstractmethod
-    def trainer(self, sequence: FrameSequence, cfg: Config) -> Trainer:
-        """A training that has not computed anything; InputError if the sequence or the config cannot be used."""
 
     @abstractmethod
     def schema(self, cfg: Config) -> dict[str, ArraySpec]:
@@ -67,7 +58,7 @@ class Method(ABC):
 
 
 def _problem(found: Any) -> str:
-    if isinstance(found, Method):
+    if isinstance(found, SceneKind):
         return ""
     options = getattr(found, "options", None)
     if not dataclasses.is_dataclass(options) or isinstance(options, type):
@@ -84,7 +75,7 @@ METHODS: Registry[Any] = Registry(
 
 
 @cache
-def method_named(name: str) -> Method:
+def method_named(name: str) -> SceneKind:
     """The method of that name.
 
     Raises:
@@ -97,12 +88,12 @@ def method_named(name: str) -> Method:
         got = f"{name!r:.80}, which no installed package has"
         raise MissingPlugin(str(input_error("method", f"one of {', '.join(known) or 'none'}", got, fix)))
     found = METHODS.load(name)
-    if not isinstance(found, Method):
+    if not isinstance(found, SceneKind):
         raise input_error("method", "a Method", f"{name}, which only trains in a benchmark", "`endoprior bench`.")
     return found
 
 
-def method_of(cfg: Config) -> Method:
+def method_of(cfg: Config) -> SceneKind:
     """The method of a config."""
     return method_named(cfg.method)
 

@@ -1,4 +1,4 @@
-"""How Gaussians move: offsets at a time, what is trained for them, and what a training step leaves for the optimizer.
+"""How Gaussians move: what is trained for it, and the offsets (`offsets.py`) that follow from it at a time.
 
 Two ways to hold motion, and a method may use both: tensors of each Gaussian, which follow it when it is cloned, split
 or removed (`basis.py` has ours); and a `Field` that all Gaussians share (`hexplane_field.py` has the paper's). Offsets
@@ -7,56 +7,19 @@ are added to the raw parameters: centers (mm), log scales, quaternions before no
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Mapping
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.config import Config
-from ..core.config_deformation import DeformationConfig, HexPlaneConfig
+from ..core.config_deformation import HexPlaneConfig
 from ..system.arrays_file import ArraySpec
-from .gaussians import attribute_shapes
-
-if TYPE_CHECKING:
-    from .gaussians import Gaussians
-    from .hexplane import PlaneGrid
-    from .ops_interface import ModelOps
-
-
-@dataclass(frozen=True)
-class Offsets:
-    """What one time step adds to the raw parameters of N Gaussians; None where nothing is added."""
-
-    means: Tensor
-    """(N, 3) displacement of the centers, mm."""
-    log_scales: Tensor | None = None
-    """(N, 3)."""
-    quats: Tensor | None = None
-    """(N, 4), added before normalization."""
-    opacity_logits: Tensor | None = None
-    """(N,)."""
-    sh_dc: Tensor | None = None
-    """(N, 3), added to the spherical-harmonic coefficient of degree 0."""
-    sh_rest: Tensor | None = None
-    """(N, (D+1)**2 - 1, 3), added to those of the other degrees."""
-    gloss: Tensor | None = None
-    """(N, 3), added to what the right eye sees more of the color, a coefficient of degree 0."""
-
-    @staticmethod
-    def from_channels(channels: dict[str, Tensor], cfg: DeformationConfig) -> Offsets:
-        """Offsets from tensors (N, width) by name, as `gaussians.offset_widths` names them; scales within bounds."""
-        if "opacity_logits" in channels:
-            channels["opacity_logits"] = channels["opacity_logits"][:, 0]
-        if "log_scales" in channels and cfg.max_scale_change > 1:
-            limit = math.log(cfg.max_scale_change)
-            channels["log_scales"] = channels["log_scales"].clamp(-limit, limit)
-        return Offsets(**channels)
+from .gaussians import Gaussians, attribute_shapes
+from .hexplane import PlaneGrid
+from .offsets import Offsets
+from .ops_interface import ModelOps
 
 
 class Field(ABC):
@@ -156,53 +119,3 @@ class Motion(ABC):
         shapes: dict[str, tuple[str | int, ...]] = {f"gaussians.{name}": ("N", *s) for name, s in per_gaussian.items()}
         shapes |= {f"field.{name}": shape for name, shape in self.field_shapes(cfg).items()}
         return {name: ArraySpec("float32", shape) for name, shape in shapes.items()}
-
-
-@dataclass(frozen=True)
-class RankOneGradient:
-    """Gradient of temporal coefficients (N, B, C) from one time step: the outer product of two vectors.
-
-    It is 30 times smaller than the coefficients, and the optimizer uses it in this form.
-    """
-
-    name: str
-    """The tensor of the Gaussians that it is the gradient of."""
-    weights: NDArray[np.float64]
-    """(B,) values of the basis functions at the time."""
-    v_offsets: Tensor
-    """(N, C) gradient of the offsets at the time."""
-
-
-class UnstoredGradient(ABC):
-    """Gradient of tensors of the Gaussians at one time, never written to memory: Adam computes it as it uses it.
-
-    For tensors so large that writing and reading their gradient costs as much as the rest of the step. CPU.
-    """
-
-    names: ClassVar[tuple[str, ...]]
-    """The tensors; they have one learning rate."""
-    v_offsets: Tensor
-    """(N, channels) gradient of the offsets at the time."""
-
-    @staticmethod
-    @abstractmethod
-    def adam_step(
-        gradients: Sequence[Any],
-        tensors: Sequence[NDArray[np.float32]],
-        firsts: Sequence[NDArray[np.float32]],
-        seconds: Sequence[NDArray[np.float32]],
-        rate: np.float32,
-        root_scale: np.float32,
-        constants: tuple[np.float32, np.float32, np.float32],
-    ) -> None:
-        """One step of Adam in place, with the sum of `gradients`, all of this class.
-
-        Args:
-            tensors, firsts, seconds: the tensors as in `names`, and Adam's moments of each.
-            rate: learning rate / (1 - beta1^steps). root_scale: 1 / sqrt(1 - beta2^steps).
-            constants: beta1, beta2, epsilon.
-        """
-
-
-Gradient = RankOneGradient | UnstoredGradient
-"""What a time step leaves for the optimizer."""

@@ -1,27 +1,14 @@
-"""Pictures of Gaussians at one time: those of several windows are mixed; those of frames are played from a cache.
-
-Frames are deformed once and cached, so that rendering one again needs no deformation.
-"""
+"""Frames of a scene of Gaussians, which are deformed once and cached: rendering one again needs no deformation."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import fields
-from functools import reduce
-from typing import TYPE_CHECKING
 
 import torch
 
-from .. import render
 from ..core.types import Camera, RenderedView, Splats
-
-if TYPE_CHECKING:
-    from .scene import Scene
-
-Background = tuple[float, float, float]
-"""Color in [0, 1]."""
-BLACK = (0.0, 0.0, 0.0)
+from .blending import faded, joined, rendered, rendered_many
+from .scene import Scene
 
 DEFAULT_MAX_BYTES = 1 << 30
 """Memory that cached frames may take; about 2 MB a frame for 40,000 Gaussians of one color each."""
@@ -75,49 +62,3 @@ class Playback:
 
 def _num_bytes(splats: Splats) -> int:
     return sum(tensor.numel() * tensor.element_size() for tensor in splats.tensors.values())
-
-
-def rendered(
-    parts: Sequence[tuple[Splats, float]], camera: Camera, backend: render.Backend, background: Background = BLACK
-) -> RenderedView:
-    """The weighted mean of what `camera` sees of each of some Gaussians."""
-    rasterize, behind = render.load(backend), parts[0][0].means.new_tensor(background)
-    return mixed([(rasterize(splats, camera, background=behind).view, weight) for splats, weight in parts])
-
-
-def rendered_many(
-    parts: Sequence[Sequence[tuple[Splats, float]]],
-    cameras: Sequence[Camera],
-    backend: render.Backend,
-    background: Background = BLACK,
-) -> list[RenderedView]:
-    """`rendered` for several cameras, in one call where the backend can."""
-    every = [(splats, camera) for some, camera in zip(parts, cameras, strict=True) for splats, _ in some]
-    behind = every[0][0].means.new_tensor(background)
-    outputs = render.load_many(backend)([s for s, _ in every], [camera for _, camera in every], background=behind)
-    views = iter(out.view for out in outputs)
-    return [mixed([(next(views), weight) for _, weight in some]) for some in parts]
-
-
-def mixed(views: Sequence[tuple[RenderedView, float]]) -> RenderedView:
-    """The weighted mean of pictures of one size; the weights add up to 1."""
-    if len(views) == 1:
-        return views[0][0]
-    names = [field.name for field in fields(RenderedView)]
-    parts = ([weight * getattr(view, name) for view, weight in views] for name in names)
-    return RenderedView(*(reduce(torch.add, part) for part in parts))
-
-
-def faded(splats: Splats, weight: float) -> Splats:
-    """`splats` with their optical depth multiplied by `weight` in (0, 1]."""
-    if weight == 1:
-        return splats
-    return Splats(**splats.tensors | {"opacities": 1 - (1 - splats.opacities) ** weight})
-
-
-def joined(parts: Sequence[Splats]) -> Splats:
-    """The Gaussians of all `parts`, which have the same tensors."""
-    if len(parts) == 1:
-        return parts[0]
-    names = [field.name for field in fields(Splats) if getattr(parts[0], field.name) is not None]
-    return Splats(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -1,4 +1,4 @@
-"""A trained scene: the tissue at any time, from any viewpoint.
+"""A trained scene of Gaussians: the tissue at any time, from any viewpoint.
 
 A scene consists of windows: spans of frames with Gaussians of their own. Most scenes have one (`SingleScene`); a long
 sequence of a moving camera has several (`WindowedScene`), and where two overlap, one fades into the other.
@@ -6,26 +6,31 @@ sequence of a moving camera has several (`WindowedScene`), and where two overlap
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .. import render
-from ..core.checks import input_error
+from ..compute.parallel_kernels import demand_unforked
 from ..core.config import Config
+from ..core.geometry import share_of_right
 from ..core.types import Camera, RenderedView, Splats
-from .method import Method, method_of
-from .photometric import behind_smoke, between
-from .playback import Background, faded, joined, rendered, rendered_many
-
-if TYPE_CHECKING:
-    from .single_scene import SingleScene
+from ..system.arrays_file import part, save_arrays
+from .blending import Background, faded, joined, rendered, rendered_many
+from .gaussians import Gaussians
+from .method import SceneKind, method_of
+from .motion import Field, Motion
+from .offsets import Offsets
+from .ops import ops_for
+from .photometric import between, is_possible
+from .rendered_scene import RenderedScene, no_gaussians
+from .scene_facts import MOST_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand, scene_facts
 
 
 @dataclass(frozen=True)
@@ -49,81 +54,6 @@ class Shown:
     window: Window
     time: float  # that time in the window's own scene, in [0, 1]
     weight: float  # in (0, 1]: 1 unless two windows overlap there; they add up to 1
-
-
-class RenderedScene(ABC):
-    """What renders the tissue at any time from any viewpoint. Frame i of T was taken at time i / T."""
-
-    config: Config
-    cameras: tuple[Camera, ...]
-    """Camera of each frame of the sequence."""
-    frames_per_second: float
-    lengths_are_relative: bool
-    """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
-
-    @property
-    @abstractmethod
-    def device(self) -> torch.device:
-        """Device that holds the scene and renders it."""
-
-    @property
-    @abstractmethod
-    def backend(self) -> str:
-        """What renders it, in words."""
-
-    @abstractmethod
-    def to(
-        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
-    ) -> RenderedScene:
-        """This scene on a device; itself if it is there.
-
-        Args:
-            backend: renders Gaussians there; None: the one they were trained with, or gsplat on a GPU.
-            fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
-        """
-
-    @abstractmethod
-    def save(self, path: Path) -> None:
-        """Write the scene as safetensors, completely or not at all.
-
-        Raises:
-            ValueError: its planes are in half precision.
-        """
-
-    @abstractmethod
-    def render(self, time: float, camera: Camera | None = None) -> RenderedView:
-        """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
-
-        Returns:
-            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, expected_depth (H, W) mm, which is
-            divided by alpha, alpha (H, W) in [0, 1], and unclamped_color (H, W, 3).
-        Raises:
-            ValueError: time is not in [0, 1].
-        """
-
-    def at(self, time: float, camera: Camera | None = None) -> Splats:
-        """The Gaussians at `time`, activated; see `Scene.at`.
-
-        Raises:
-            InputError: it is a radiance field, which has none.
-        """
-        return with_gaussians(self).at(time, camera)
-
-    def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
-        """`render` at several times, one camera each."""
-        return [self.render(time, camera) for time, camera in zip(times, cameras, strict=True)]
-
-    def smoke_at(self, _time: float) -> Tensor | None:
-        """(I, J, 2) gain and veil of the smoke that the endoscope sees at a time: see `photometric`; None: none."""
-        return None
-
-    def filmed(self, time: float, camera: Camera | None = None) -> RenderedView:
-        """`render` with the smoke of that time, as frames show it."""
-        return behind_smoke(self.render(time, camera), self.smoke_at(time))
-
-    def camera_at(self, time: float) -> Camera:
-        """Camera of the frame nearest in time."""
-        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
 
 
 class Scene(RenderedScene):
@@ -208,7 +138,7 @@ class Scene(RenderedScene):
         return rendered_many(parts, cameras, self.backend, self.background)
 
     @cached_property
-    def method(self) -> Method:
+    def method(self) -> SceneKind:
         """The method that trained it."""
         return method_of(self.config)
 
@@ -227,11 +157,162 @@ class Scene(RenderedScene):
         return "gsplat" if on_gpu else "numba"
 
 
+@dataclass(frozen=True)
+class SingleScene(Scene):
+    """A scene of one window: canonical Gaussians, their motion and the cameras of the sequence."""
+
+    gaussians: Gaussians
+    field: Field | None
+    """What they share to move, if the method has such a thing."""
+    config: Config
+    cameras: tuple[Camera, ...]
+    frames_per_second: float
+    prior_score: Tensor
+    """(N,) texture-prior score of each Gaussian."""
+    num_valid: Tensor
+    """(N,) projections that score was averaged over."""
+    lengths_are_relative: bool = False
+    trained_from: float = 0.0
+    """Time of the first frame that motion was trained on; before it, motion is what it is then ..."""
+    trained_until: float = 1.0
+    """... and after this one too: a temporal basis that nothing holds leads anywhere."""
+    rendered_by: render.Backend | None = None
+    baseline_mm: float = 0.0
+    """From the left to the right camera, where both were trained on: what `gloss` is seen from; 0: from nowhere."""
+    smoke: Tensor | None = None
+    """(T, I, J, 2) gain and veil of each frame: see `photometric`; None: no smoke."""
+    tissue: Tensor | None = None
+    """(T, I, J) share of each cell of the frame that is tissue, 0..255: see `uncertainty`; None: not known."""
+    depth_noise: float = 0.0
+    """How far rendered depth is from measured depth, as a share of it; 0: not known."""
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    def windows(self) -> tuple[Window]:
+        """The scene itself is its only window."""
+        return (Window(0, len(self.cameras), lambda: self),)
+
+    @torch.no_grad()
+    def at(self, time: float, camera: Camera | None = None) -> Splats:
+        """See `Scene.at`."""
+        demand_unforked()  # torch would wait for threads that are not there, before the first kernel is reached
+        if not 0 <= time <= 1:
+            raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
+        share = 0.0
+        if camera is not None and self.baseline_mm:
+            share = share_of_right(camera, self.camera_at(time), self.baseline_mm)
+        return self._splats(self.offsets(self.gaussians, time), share)
+
+    def parts_at(self, time: float, camera: Camera | None = None) -> list[tuple[Splats, float]]:
+        """See `Scene.parts_at`."""
+        return [(self.at(time, camera), 1.0)]
+
+    def offsets(self, gaussians: Gaussians, time: float) -> Offsets:
+        """Deformation of some Gaussians of the scene at `time` in [0, 1]."""
+        held = min(max(time, self.trained_from), self.trained_until)
+        return self.motion.offsets(gaussians, self.field, held, self.config, ops_for(self.device))
+
+    @cached_property
+    def motion(self) -> Motion:
+        """How its Gaussians move."""
+        return self.method.motion(self.config)
+
+    @torch.no_grad()
+    def canonical(self) -> Splats:
+        """The Gaussians as they are stored, before any motion, activated."""
+        return self._splats(None)
+
+    def _splats(self, offsets: Offsets | None, right_share: float = 0.0) -> Splats:
+        found = self.gaussians.splats(offsets, self.config.schedule.sh_degree, right_share)
+        # A tensor that no deformation changes is the trained tensor itself, with its gradient.
+        return Splats(**{name: value.detach() for name, value in found.tensors.items()})
+
+    @property
+    def device(self) -> torch.device:
+        """See `Scene.device`."""
+        return self.gaussians["means"].device
+
+    def to(
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
+    ) -> SingleScene:
+        """See `Scene.to`."""
+        gaussians = self.gaussians.to(device)
+        field = self.field and self.field.to(device, fp16_planes=fp16_planes)
+        if gaussians is self.gaussians and field is self.field and backend in (None, self.rendered_by):
+            return self
+        return replace(
+            self,
+            rendered_by=backend,
+            gaussians=gaussians,
+            field=field,
+            prior_score=self.prior_score.to(device),
+            num_valid=self.num_valid.to(device),
+        )
+
+    def changed(self, change: Callable[[SingleScene, Window], SingleScene]) -> SingleScene:
+        """See `Scene.changed`."""
+        return change(self, self.windows[0])
+
+    @staticmethod
+    def of_arrays(
+        arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts, motion: Motion
+    ) -> SingleScene:
+        """The scene that `save` wrote as these arrays, which fit its method's `schema`.
+
+        Raises:
+            InputError: a value that no scene can have.
+        """
+        num, quats = len(arrays["gaussians.means"]), arrays["gaussians.quats"]
+        demand(
+            ("gaussians", num <= MOST_GAUSSIANS, f"at most {MOST_GAUSSIANS:,} Gaussians"),
+            ("gaussians.quats", not num or bool((quats.abs().amax(1) >= 1e-12).all()), "no quaternion of length 0"),
+            ("num_valid", bool((arrays["num_valid"] >= 0).all()), "counts"),
+            ("smoke", "smoke" not in arrays or is_possible(arrays["smoke"]), "gains and veils"),
+        )
+        return SingleScene(
+            Gaussians(part(arrays, "gaussians.")),
+            motion.field_of(part(arrays, "field."), facts.config),
+            facts.config,
+            cameras,
+            facts.frames_per_second,
+            arrays["prior_score"],
+            arrays["num_valid"],
+            facts.lengths_are_relative,
+            facts.trained_from,
+            facts.trained_until,
+            baseline_mm=facts.baseline_mm,
+            smoke=arrays.get("smoke"),
+            tissue=arrays.get("tissue"),
+            depth_noise=facts.depth_noise,
+        )
+
+    def save(self, path: Path) -> None:
+        """See `Scene.save`."""
+        if self.field is not None and self.field.grid is not None and self.field.grid.values.dtype != torch.float32:
+            raise ValueError("save the scene itself, not a copy with fp16 planes")
+        arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
+        arrays |= {"prior_score": self.prior_score, "num_valid": self.num_valid}
+        arrays |= camera_arrays(self.cameras)
+        if self.field is not None:
+            arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
+        about: dict[str, Any] = {"trained_from": self.trained_from, "trained_until": self.trained_until}
+        if self.baseline_mm:
+            about["baseline_mm"] = self.baseline_mm
+        if self.smoke is not None:
+            arrays["smoke"], about["smoke"] = self.smoke, True
+        if self.tissue is not None:
+            arrays["tissue"], about["tissue"] = self.tissue, True
+        if self.depth_noise:
+            about["depth_noise"] = self.depth_noise
+        save_arrays(path, arrays, scene_facts(self) | about, SCENE_FORMAT)
+
+
 def with_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> Scene:
     """The scene; InputError, which names `subject`, if it is a radiance field."""
     if not isinstance(scene, Scene):
-        fix = "`endoprior render RUN` makes images and a video of it."
-        raise input_error(subject, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)
+        raise no_gaussians(scene, subject)
     return scene
 
 

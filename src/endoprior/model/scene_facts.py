@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,10 +14,10 @@ from ..core.config import Config
 from ..core.config_io import to_dict
 from ..core.ranges import Checked, Range
 from ..core.types import Camera
+from .rendered_scene import RenderedScene
 
-if TYPE_CHECKING:
-    from .scene import RenderedScene
-
+SCENE_FORMAT = "endoprior-scene-1"
+"""Name and version of the file format, in the file's metadata."""
 LARGEST_SIDE = 2**16
 """Largest width or height of an image, px."""
 LARGEST_IMAGE = 2**26

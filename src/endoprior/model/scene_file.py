@@ -23,9 +23,8 @@ from ..system.arrays_file import ArraySpec, load_arrays, rejecting
 from . import windowed_scene
 from .method import config_from, method_of
 from .photometric import GRID
-from .scene import RenderedScene
-from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SceneFacts, camera_arrays, demand
-from .single_scene import SCENE_FORMAT, SingleScene
+from .scene import RenderedScene, SingleScene
+from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand
 from .uncertainty import CELLS
 from .windowed_scene import Span, WindowedScene, window_file
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.geometry import back_project, bilinear, cells_at, expected_depth, project
 from ..core.types import SURE_DEPTH, Camera, Frame
-from .scene import Scene, Window
-from .single_scene import SingleScene
+from .scene import Scene, SingleScene, Window
 
 HIDDEN_SHARE = 0.04
 """A point is hidden if it lies deeper than the rendered surface at its pixel by more than this share (docs/log.md)."""

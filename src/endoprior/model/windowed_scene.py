@@ -14,9 +14,8 @@ from ..core.config import Config
 from ..core.types import Camera
 from ..system.arrays_file import save_arrays
 from ..system.memory import BoundedCache
-from .scene import Scene, Window
+from .scene import Scene, SingleScene, Window
 from .scene_facts import camera_arrays, scene_facts
-from .single_scene import SingleScene
 
 WINDOWS_FORMAT = "endoprior-windows-1"
 """Name and version of the file that lists the windows, in its metadata."""

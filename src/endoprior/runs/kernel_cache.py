@@ -172,6 +172,7 @@ def main() -> None:
     from numba.core import event
 
     from ..evaluation.scoring import evaluate  # which takes long to import
+    from ..training.method import trainer_for
 
     class Counting(event.Listener):
         """Prints how many kernels have been compiled so far."""
@@ -189,7 +190,7 @@ def main() -> None:
 
     cfg, sequence = shortened(config_from(json.load(sys.stdin))), tiny_sequence()
     with event.install_listener("numba:compile", Counting()):
-        trainer = method_of(cfg).trainer(sequence, cfg)
+        trainer = trainer_for(sequence, cfg)
         trainer.start()
         while not trainer.finished:
             trainer.step()

@@ -19,15 +19,15 @@ from ..core.config import Config
 from ..data import FrameSequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
 from ..model.method import method_of
-from ..model.scene import RenderedScene
+from ..model.scene import RenderedScene, SingleScene
 from ..model.scene_file import load_scene
-from ..model.single_scene import SingleScene
 from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
 from ..system.atomic import write_text, writing
 from ..system.console import complain
 from ..system.memory import freed_memory_kept
 from ..training.divergence import Diverged
 from ..training.error_sources import with_error_sources
+from ..training.method import trainer_for
 from ..training.preflight import note_on_budget, reject_ignored_options, reject_too_large
 from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
 from . import kernel_cache
@@ -189,7 +189,7 @@ class TrainingRun:
         say(f"{sequence.path}: {len(sequence)} frames; backend {cfg.render.backend}")
         for warning in sequence.validate():
             say(f"note: {warning}")
-        self.trainer = method_of(cfg).trainer(sequence, cfg)
+        self.trainer = trainer_for(sequence, cfg)
         for note in self.trainer.notes():
             say(f"note: {note}")
 

@@ -27,7 +27,7 @@ from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
 from ..compute.simd import LANES, prefetch
 from ..model.hexplane import FRESH, TOUCHED, PlaneGrid
-from ..model.motion import RankOneGradient, UnstoredGradient
+from ..model.offsets import RankOneGradient, UnstoredGradient
 
 BETA1, BETA2 = 0.9, 0.999
 CHUNK = 128  # rows per task

@@ -10,8 +10,7 @@ import torch
 
 from ..core.types import Frame
 from ..data import FrameSequence
-from ..model.scene import RenderedScene
-from ..model.single_scene import SingleScene
+from ..model.scene import RenderedScene, SingleScene
 from ..model.surface import render_surface
 from ..model.uncertainty import CELLS
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -17,23 +17,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.config import Config
 from ..core.shell import command
 from ..data import FrameSequence
+from ..initialization.first_gaussians import create_gaussians
 from ..model.basis import GIVEN, TRAINED
-from ..model.gaussians import Gaussians, create_gaussians
+from ..model.gaussians import Gaussians
 from ..model.hexplane import plane_shapes
 from ..model.method import method_of
 from ..model.motion import Field, Motion
 from ..model.photometric import of_all_frames
-from ..model.scene_file import check_cameras
-from ..model.single_scene import SingleScene
+from ..model.scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
 from .density import scene_extent
 from .density_stats import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
+from .gaussian_hooks import GaussianHooks
 from .missed_tools import VISITS, MaskDoubt
 from .ops import ops_for
 from .ops_interface import TrainingOps
@@ -42,10 +43,7 @@ from .photometric import ClearedFrames, smoke_of
 from .state import GaussiansState
 from .step import TrainingStep
 from .tracks import StartTracks
-from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
-
-if TYPE_CHECKING:
-    from .gaussian_method import GaussianMethod
+from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, cameras_of, device_for, stage_length
 
 STILL_CAMERA_SCALE = 10.0  # spatial scale of a sequence with a static camera, mm
 
@@ -99,16 +97,12 @@ class GaussianTrainer(Trainer):
         if cfg.data.eyes == "both" and sequence.right_eye is None:
             fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."
             raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
-        self.method = cast("GaussianMethod", method_of(cfg))
+        self.method = cast(GaussianHooks, method_of(cfg))
         self.sequence, self.cfg = sequence, self.method.fitted(cfg, len(sequence))
         self.motion = self.method.motion(self.cfg)
         self.device = device_for(cfg.render.backend)
         self.ops = ops or ops_for(self.device)
-        self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
-        try:
-            check_cameras(self.cameras)
-        except InputError as error:
-            raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
+        self.cameras = cameras_of(sequence)
         frames = TrainingFrames(sequence, "zero" if cfg.released.prior else "reflect", self.device)
         centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
         extent = scene_extent(centers)

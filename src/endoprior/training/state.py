@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..core.types import RenderOutput, Splats
 from ..model.gaussians import Gaussians
-from ..model.motion import Field, Offsets
+from ..model.motion import Field
+from ..model.offsets import Offsets
 from .density_stats import DensityStats
 from .frames import TrainingFrame
 from .optimizer import Optimizer

@@ -7,7 +7,7 @@ import math
 import time as clock
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,15 +23,13 @@ from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrames
+from .gaussian_hooks import GaussianHooks
 from .losses import color_l1
 from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
 from .ops_interface import TrainingOps
 from .state import Before, Drawn, GaussiansState
 from .temporal import temporal_terms
 from .trainer import Stage, StepReport, stage_length
-
-if TYPE_CHECKING:
-    from .gaussian_method import GaussianMethod
 
 RESET_OPACITY = 0.01  # where methods that reset opacities lower them to (3DGS)
 MAX_SCALE_SHARE = 0.016
@@ -46,7 +44,7 @@ class TrainingStep:
     Every random choice is a pure function of (seed, stage, iteration), so a resumed run repeats an uninterrupted one.
     """
 
-    method: GaussianMethod
+    method: GaussianHooks
     motion: Motion  # that of the method
     cfg: Config
     frames: TrainingFrames
@@ -60,7 +58,7 @@ class TrainingStep:
 
     @cached_property
     def context(self) -> Any:
-        """See `GaussianMethod.context`."""
+        """See `GaussianHooks.context`."""
         return self.method.context(self.frames, self.cfg)
 
     def __call__(self, state: GaussiansState) -> StepReport:

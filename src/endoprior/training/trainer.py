@@ -15,8 +15,10 @@ from torch import Tensor
 from .. import render
 from ..core.checks import InputError
 from ..core.config import Config
+from ..core.types import Camera
 from ..data import FrameSequence
-from ..model.scene import RenderedScene
+from ..model.rendered_scene import RenderedScene
+from ..model.scene_file import check_cameras
 from ..system.arrays_file import ArraySpec
 
 DEFAULT_FRAMES_PER_SECOND = 25.0  # playing speed of a sequence that does not state its own
@@ -138,6 +140,16 @@ class Trainer(ABC):
 
 
 Observer = Callable[[StepReport, Trainer], None]  # called after each iteration: progress, log, checkpoints, viewer
+
+
+def cameras_of(sequence: FrameSequence) -> tuple[Camera, ...]:
+    """The camera of each frame; InputError if a scene with them could not be loaded again."""
+    cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
+    try:
+        check_cameras(cameras)
+    except InputError as error:
+        raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
+    return cameras
 
 
 def device_for(backend: render.Backend) -> torch.device:

@@ -7,8 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from ...model.playback import Playback
-from ...model.scene import RenderedScene, Scene
-from ...model.single_scene import SingleScene
+from ...model.scene import RenderedScene, Scene, SingleScene
 from ...system.devices import wait_for
 from ..context import SPEED_OFF, EvaluationContext
 from ..score import Score, ScoreUnavailable

@@ -13,8 +13,8 @@ from itertools import product
 
 import numpy as np
 
-from ...core.geometry import expected_depth
-from ...footage.stereo_order import measured_disparity, right_camera, warp_to_right
+from ...core.geometry import expected_depth, right_camera
+from ...footage.stereo_order import measured_disparity, warp_to_right
 from ..context import EvaluationContext
 from ..score import Score
 from .depth import depth_rmse

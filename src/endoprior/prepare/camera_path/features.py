@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...footage.alignment import align
+from ...footage.keypoints import keypoints
 from ...footage.optical_flow import fixed_in_image, follow_both_ways
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
@@ -185,10 +186,7 @@ class KeyframeMatch:
 def keyframe(index: int, view: TrackingFrame) -> Keyframe:
     """Describe a frame by its SIFT keypoints on tissue with depth."""
     mask = (view.usable & (view.depth > 0)).astype(np.uint8)
-    found, descriptors = cv2.SIFT.create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(view.plain, mask)
-    if descriptors is None:
-        found, descriptors = (), np.zeros((0, 128), np.float32)
-    pixels = np.array([point.pt for point in found], np.float32).reshape(-1, 2)
+    pixels, descriptors = keypoints(view.plain, KEYPOINTS, mask, 0.01)
     depths = sampled(view.depth, pixels).astype(np.float32)
     kept = depths > 0
     no_track = np.full(kept.sum(), -1, np.int32)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...footage.optical_flow import follow_and_return
 from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
 from .even_view import EvenView, Warp
@@ -115,18 +116,8 @@ def _found(
     """(N, 2) px of the corners (N, 2) in another frame, NaN where they are not found."""
     x, y, _ = (each.astype(np.float32) for each in warp.at(inverse))
     warped = np.asarray(cv2.remap(other.detail_u8, x, y, cv2.INTER_LINEAR, borderValue=128), np.uint8)
-    now, back = _flow(detail_u8, warped, pixels), pixels
-    back = _flow(warped, detail_u8, now)
-    good = (np.hypot(*(back - pixels).T) < MOST_BACK_PX) & (np.hypot(*(now - pixels).T) < MOST_SHIFT_PX)
+    now, back, good = follow_and_return(detail_u8, warped, pixels, side_px=WINDOW_PX, halvings=LEVELS, criteria=STOP)
+    good &= (np.hypot(*(back - pixels).T) < MOST_BACK_PX) & (np.hypot(*(now - pixels).T) < MOST_SHIFT_PX)
     place = np.stack([cv2.remap(each, now[:, :1], now[:, 1:], cv2.INTER_LINEAR).ravel() for each in (x, y)], 1)
     inner = cv2.remap(other.inner, place[:, :1], place[:, 1:], cv2.INTER_NEAREST, borderValue=0).ravel() > 0
     return np.where((good & inner)[:, None], place, np.nan).astype(np.float32)
-
-
-def _flow(first: NDArray[np.uint8], second: NDArray[np.uint8], pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, 2) where the second image shows pixels of the first one; far away where the flow finds nothing."""
-    found, done, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, pixels, pixels.copy(), winSize=(WINDOW_PX,) * 2, maxLevel=LEVELS,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, criteria=STOP,
-    )  # fmt: skip
-    return np.where(done.reshape(-1, 1) > 0, found, np.float32(-1e4)).astype(np.float32)

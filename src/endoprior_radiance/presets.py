@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
-from endoprior.core.config import Config
+from endoprior import Config, preset
 from endoprior.core.ranges import Checked, Count, Range
-from endoprior.model.presets import paper
 
 SIZED_ITERATIONS, PUBLISHED_ITERATIONS = 2_000, 100_000
 
@@ -66,5 +65,5 @@ def endosurf_published() -> Config:
 
 
 def _config(method: str, iterations: int, radiance: RadianceConfig) -> Config:
-    base = RadianceFieldConfig(**vars(paper()) | {"method": method, "radiance": radiance})
+    base = RadianceFieldConfig(**vars(preset("paper")) | {"method": method, "radiance": radiance})
     return replace(base, schedule=replace(base.schedule, coarse_iterations=0, fine_iterations=iterations))

@@ -18,9 +18,9 @@ from torch.nn.functional import normalize
 from typing_extensions import override
 
 from endoprior.compute.neighbors import nearest
+from endoprior.compute.relu_network import BLOCK_ROWS
 from endoprior.core.geometry import back_project, pixel_centers
 
-from ..relu_network import BLOCK_ROWS
 from .endosurf_networks import SHARPNESS, ColorNetwork, DeformationNetwork, SurfaceNetwork
 from .field import RadianceField, RayBatch, uniform
 from .presets import RadianceConfig

@@ -1,4 +1,4 @@
-"""Frequency encoding, and linear layers whose first weights come from a given generator, never from the global one."""
+"""Linear layers whose first weights come from a given generator, never from the global one."""
 
 from __future__ import annotations
 
@@ -9,22 +9,8 @@ import torch
 from torch import Generator, Tensor, nn
 
 
-def encoded_size(dims: int, num: int) -> int:
-    """Length of the encoding of `dims` numbers with `num` frequencies."""
-    return dims * (1 + 2 * num)
-
-
-def encoded(x: Tensor, num: int) -> Tensor:
-    """(..., D (1 + 2 num)) x (..., D), then sin(2^k x) and cos(2^k x) for k < `num`: NeRF's encoding without factor pi.
-
-    A small network cannot fit fine detail of its raw inputs.
-    """
-    waves = [wave(x * 2.0**k) for k in range(num) for wave in (torch.sin, torch.cos)]
-    return torch.cat([x, *waves], -1)
-
-
 def encoded_change(x: Tensor, dx: Tensor, num: int) -> Tensor:
-    """How `encoded(x)` changes when x changes along `dx` (..., D): its directional derivative."""
+    """How `frequency_encoding.encoded(x)` changes when x changes along `dx` (..., D): its directional derivative."""
     parts = [dx]
     for k in range(num):
         angle, rate = x * 2.0**k, dx * 2.0**k

@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from endoprior import Camera, FrameSequence
 from endoprior.core.checks import input_error
 from endoprior.core.geometry import FARTHEST_MM
-from endoprior.core.types import Camera, Frame
-from endoprior.data import FrameSequence
+from endoprior.core.types import Frame
 
 MOST_DEPTHS = 2**22
 """Depths over which percentiles are taken, about: evenly spaced pixels of all frames."""

@@ -8,7 +8,9 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn.functional import linear, softplus
 
-from .layers import NormedLinear, encoded, encoded_change, encoded_size, layers_of, start
+from endoprior.compute.frequency_encoding import encoded, encoded_size
+
+from .layers import NormedLinear, encoded_change, layers_of, start
 
 DEFORMED, TIME, SURFACE, COLORED, DIRECTION = 6, 6, 6, 10, 4
 """Frequencies: position and time of the deformation, position of the distance, position and direction of the color."""

@@ -12,13 +12,18 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from endoprior.core.checks import InputError
-from endoprior.core.config import Config
-from endoprior.data import FrameSequence
-from endoprior.model.scene_file import check_cameras
+from endoprior import Config, FrameSequence
 from endoprior.system.arrays_file import ArraySpec, part
 from endoprior.training.divergence import LARGEST_GRADIENT, Diverged, Watch, unusable_numbers
-from endoprior.training.trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
+from endoprior.training.trainer import (
+    DEFAULT_FRAMES_PER_SECOND,
+    Stage,
+    StepReport,
+    Trainer,
+    cameras_of,
+    device_for,
+    stage_length,
+)
 
 from .field import RadianceField, RayBatch
 from .presets import radiance_of
@@ -96,11 +101,7 @@ class RadianceTrainer(Trainer):
         self.sequence, self.cfg, self.kind = sequence, cfg.fitted(len(sequence)), kind
         self.radiance = radiance_of(self.cfg)
         self.device = device_for(cfg.render.backend)
-        self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
-        try:
-            check_cameras(self.cameras)
-        except InputError as error:
-            raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
+        self.cameras = cameras_of(sequence)
         self.frames = RayFrames(sequence, only_measured=kind.only_measured)
         self._watch = Watch(ADVICE)
 

@@ -9,11 +9,10 @@ from pathlib import Path
 import torch
 from typing_extensions import override
 
-from endoprior.core.config import Config
-from endoprior.core.types import Camera, RenderedView
-from endoprior.model.scene import RenderedScene
-from endoprior.model.scene_facts import camera_arrays, scene_facts
-from endoprior.model.single_scene import SCENE_FORMAT
+from endoprior import Camera, Config
+from endoprior.core.types import RenderedView
+from endoprior.model.rendered_scene import RenderedScene
+from endoprior.model.scene_facts import SCENE_FORMAT, camera_arrays, scene_facts
 from endoprior.render import Backend
 from endoprior.system.arrays_file import save_arrays
 

@@ -13,9 +13,11 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import huber_loss
 from typing_extensions import override
 
-from ..relu_network import relu_network
+from endoprior.compute.frequency_encoding import encoded, encoded_size
+from endoprior.compute.relu_network import relu_network
+
 from .field import RadianceField, RayBatch, normal, uniform
-from .layers import Linear, encoded, encoded_size, layers_of, start
+from .layers import Linear, layers_of, start
 from .presets import RadianceConfig
 from .rays import (
     Composited,

@@ -8,13 +8,10 @@ from typing import Any
 from torch import Tensor
 from typing_extensions import override
 
-from endoprior.core.checks import InputError
-from endoprior.core.config import Config
-from endoprior.core.types import Camera
-from endoprior.data import FrameSequence
-from endoprior.model.method import Method
+from endoprior import Camera, Config, FrameSequence, InputError
 from endoprior.model.scene_facts import SceneFacts
 from endoprior.system.arrays_file import ArraySpec, part
+from endoprior.training.method import Method
 
 from . import presets
 from .endonerf import EndoNeRF

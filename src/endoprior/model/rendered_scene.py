@@ -1,0 +1,97 @@
+"""What every scene is: the tissue at any time, rendered from any viewpoint. One of Gaussians is a `scene.Scene`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from .. import render
+from ..core.checks import InputError, input_error
+from ..core.config import Config
+from ..core.types import Camera, RenderedView, Splats
+from .photometric import behind_smoke
+
+
+class RenderedScene(ABC):
+    """What renders the tissue at any time from any viewpoint. Frame i of T was taken at time i / T."""
+
+    config: Config
+    cameras: tuple[Camera, ...]
+    """Camera of each frame of the sequence."""
+    frames_per_second: float
+    lengths_are_relative: bool
+    """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Device that holds the scene and renders it."""
+
+    @property
+    @abstractmethod
+    def backend(self) -> str:
+        """What renders it, in words."""
+
+    @abstractmethod
+    def to(
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
+    ) -> RenderedScene:
+        """This scene on a device; itself if it is there.
+
+        Args:
+            backend: renders Gaussians there; None: the one they were trained with, or gsplat on a GPU.
+            fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
+        """
+
+    @abstractmethod
+    def save(self, path: Path) -> None:
+        """Write the scene as safetensors, completely or not at all.
+
+        Raises:
+            ValueError: its planes are in half precision.
+        """
+
+    @abstractmethod
+    def render(self, time: float, camera: Camera | None = None) -> RenderedView:
+        """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
+
+        Returns:
+            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, expected_depth (H, W) mm, which is
+            divided by alpha, alpha (H, W) in [0, 1], and unclamped_color (H, W, 3).
+        Raises:
+            ValueError: time is not in [0, 1].
+        """
+
+    def at(self, time: float, camera: Camera | None = None) -> Splats:
+        """The Gaussians at `time`, activated; see `Scene.at`.
+
+        Raises:
+            InputError: it is a radiance field, which has none.
+        """
+        del time, camera  # for subclasses
+        raise no_gaussians(self)
+
+    def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
+        """`render` at several times, one camera each."""
+        return [self.render(time, camera) for time, camera in zip(times, cameras, strict=True)]
+
+    def smoke_at(self, _time: float) -> Tensor | None:
+        """(I, J, 2) gain and veil of the smoke that the endoscope sees at a time: see `photometric`; None: none."""
+        return None
+
+    def filmed(self, time: float, camera: Camera | None = None) -> RenderedView:
+        """`render` with the smoke of that time, as frames show it."""
+        return behind_smoke(self.render(time, camera), self.smoke_at(time))
+
+    def camera_at(self, time: float) -> Camera:
+        """Camera of the frame nearest in time."""
+        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
+
+
+def no_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> InputError:
+    """The error, which names `subject`, where Gaussians are needed and the scene is a radiance field."""
+    fix = "`endoprior render RUN` makes images and a video of it."
+    return input_error(subject, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)

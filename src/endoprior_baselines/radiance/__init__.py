@@ -1,1 +1,0 @@
-"""Radiance fields: networks that give density or distance and color at any point and time, rendered along rays."""
