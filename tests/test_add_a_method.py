@@ -26,6 +26,7 @@ from endoprior.evaluation.registry import all_scores
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.method import METHODS, config_from, method_named, method_of
 from endoprior.model.presets import preset, preset_names
+from endoprior.model.scene_facts import SCENE_FORMAT
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
 from endoprior.system.arrays_file import save_arrays

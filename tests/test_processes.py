@@ -26,14 +26,34 @@ def run(data) -> Path:
     return data.with_name("run")
 
 
-def printed(script: str, folder: Path, *words: object, layer: str = "omp") -> str:
+def printed(script: str, folder: Path, *words: object, layer: str = "omp", threads: int = 2) -> str:
     """What a script prints in a process of its own; it must end by itself."""
     (folder / "script.py").write_text(script)
-    environment = os.environ | {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "2"}
+    environment = os.environ | {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": str(threads)}
     line = [sys.executable, str(folder / "script.py"), *map(str, words)]
     done = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+TWICE = """import sys
+from pathlib import Path
+import torch
+import endoprior
+
+sys.path.insert(0, sys.argv[2])
+from tiny_training import tiny_config
+
+torch.set_num_threads(2)  # Numba will have one, and so will torch, from the moment when Numba starts it
+for name in ("first", "second"):
+    endoprior.train(endoprior.load_sequence(sys.argv[1]), tiny_config("hexplane", 2, 10), name)
+print(Path("first/scene.safetensors").read_bytes() == Path("second/scene.safetensors").read_bytes())
+"""
+
+
+def test_the_first_training_of_a_process_gives_the_bits_of_the_second(data, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert printed(TWICE, tmp_path, data, Path(__file__).parent, threads=1).split() == ["True"]
 
 
 FORK = """import multiprocessing, sys

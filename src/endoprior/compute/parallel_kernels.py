@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from numba import njit
+from numba import get_num_threads, njit
 from numba.np.ufunc import threading_layer
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -70,6 +70,17 @@ def parallel_njit(**options: Any) -> Callable[[Function], Function]:
         return guarded  # pyright: ignore[reportReturnType]
 
     return decorate
+
+
+def start_threads() -> None:
+    """Start Numba's threads now, not with the first kernel.
+
+    Where they are those of OpenMP, which torch uses too, starting them sets its number of threads to
+    `NUMBA_NUM_THREADS`; and torch rounds differently with another number. A training that starts them first gives the
+    same bits whether the process has run kernels before or not.
+    """
+    demand_unforked()
+    get_num_threads()
 
 
 def demand_unforked() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.parallel_kernels import demand_unforked
+from ..compute.parallel_kernels import start_threads
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..data import FrameSequence, Split
@@ -66,7 +66,7 @@ def evaluate(
         >>> result.protocol["frames"], 0 < result.scores["psnr"] < 99
         ([1, 9], True)
     """
-    demand_unforked()
+    start_threads()
     rendering: dict[str, str] = {}
     if isinstance(scene, RenderedScene):
         if reading is None:

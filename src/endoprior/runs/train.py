@@ -13,7 +13,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from ..check.errors import find_errors
-from ..compute.parallel_kernels import demand_unforked
+from ..compute.parallel_kernels import start_threads
 from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
@@ -123,7 +123,7 @@ def start_run(
     Raises:
         InputError: see `train`.
     """
-    demand_unforked()
+    start_threads()
     reject_ignored_options(cfg)
     if note := note_on_budget(cfg):
         say(f"note: {note}")
