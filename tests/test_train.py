@@ -126,6 +126,21 @@ def test_a_sequence_that_was_opened_without_a_config_is_read_as_the_preset_has_i
     assert scored.scores == again.scores and scored.protocol["shrink"] == 2 and "psnr" in scored.scores
 
 
+def test_only_the_sequence_of_a_scene_is_scored_but_at_any_shrink(make_tiny_sequence):
+    folder = make_tiny_sequence("one", num_frames=9)
+    scene = train(load_sequence(folder), tiny_config("basis", 0, 1))
+    other = make_tiny_sequence("two", num_frames=9, width=56)
+    with pytest.raises(InputError, match=r"two: expected images of 48x40 px, .* got 56x40\. Fix: Pass [^\n]*$"):
+        evaluate(scene, load_sequence(other), networks=False, speed=False)
+    with pytest.raises(InputError, match="got 28x20"):
+        evaluate(scene, load_sequence(other, DataConfig(shrink=2)), networks=False, speed=False)
+    with pytest.raises(InputError, match=r"expected the 9 frames .* got 8\. Fix"):
+        evaluate(scene, load_sequence(folder, DataConfig(first_frames=8)), networks=False, speed=False)
+    for shrink in (2, 3):
+        small = load_sequence(folder, DataConfig(shrink=shrink))
+        assert "psnr" in evaluate(scene, small, networks=False, speed=False).scores
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS.names())
 def test_the_flow_of_the_readme_works_for_every_preset(name, tiny_sequence):
