@@ -25,7 +25,7 @@ from endoprior.initialization.first_gaussians import FirstGaussians, resting_sph
 from endoprior.initialization.sampling import PointCloud, concatenated, has_surface
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Field, Motion, Offsets
-from endoprior.model.ops import ModelOps
+from endoprior.model.ops_interface import ModelOps
 from endoprior.training.optimizer import Rate, rate_of
 
 from .learned_basis import COEFFICIENTS, value_at
