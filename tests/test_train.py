@@ -126,6 +126,14 @@ def test_a_sequence_that_was_opened_without_a_config_is_read_as_the_preset_has_i
     assert scored.scores == again.scores and scored.protocol["shrink"] == 2 and "psnr" in scored.scores
 
 
+def test_a_scene_knows_its_number_of_gaussians_and_is_saved_by_a_name(tiny_sequence, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = train(load_sequence(tiny_sequence), tiny_config("basis", 0, 1))
+    scene.save("a.safetensors")
+    again = endoprior.load_scene("a.safetensors")
+    assert len(again) == len(scene) == len(again.at(0.5).means)
+
+
 def test_only_the_sequence_of_a_scene_is_scored_but_at_any_shrink(make_tiny_sequence):
     folder = make_tiny_sequence("one", num_frames=9)
     scene = train(load_sequence(folder), tiny_config("basis", 0, 1))

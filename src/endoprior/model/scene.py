@@ -83,7 +83,7 @@ class RenderedScene(ABC):
         """
 
     @abstractmethod
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the scene as safetensors, completely or not at all.
 
         Raises:
@@ -100,6 +100,18 @@ class RenderedScene(ABC):
         Raises:
             ValueError: time is not in [0, 1].
         """
+
+    def __bool__(self) -> bool:
+        """A scene is one without any Gaussians too."""
+        return True
+
+    def __len__(self) -> int:
+        """Number of Gaussians in all windows.
+
+        Raises:
+            InputError: it is a radiance field, which has none.
+        """
+        return len(with_gaussians(self))
 
     def at(self, time: float, camera: Camera | None = None) -> Splats:
         """The Gaussians at `time`, activated; see `Scene.at`.

@@ -159,7 +159,7 @@ class SingleScene(Scene):
             depth_noise=facts.depth_noise,
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """See `Scene.save`."""
         if self.field is not None and self.field.grid is not None and self.field.grid.values.dtype != torch.float32:
             raise ValueError("save the scene itself, not a copy with fp16 planes")
@@ -177,4 +177,4 @@ class SingleScene(Scene):
             arrays["tissue"], about["tissue"] = self.tissue, True
         if self.depth_noise:
             about["depth_noise"] = self.depth_noise
-        save_arrays(path, arrays, scene_facts(self) | about, SCENE_FORMAT)
+        save_arrays(Path(path), arrays, scene_facts(self) | about, SCENE_FORMAT)
