@@ -134,6 +134,22 @@ def test_a_scene_knows_its_number_of_gaussians_and_is_saved_by_a_name(tiny_seque
     assert len(again) == len(scene) == len(again.at(0.5).means)
 
 
+def test_a_wrong_argument_is_said_in_one_line(tiny_sequence):
+    sequence, cfg = load_sequence(tiny_sequence), tiny_config("basis", 0, 1)
+    scene = train(sequence, cfg)
+    for call, says in (
+        (lambda: train("DATA", cfg), "sequence: expected a FrameSequence, got 'DATA'. Fix: `endoprior.load_sequence("),
+        (lambda: train(sequence, "preview"), "cfg: expected a Config, got 'preview'. Fix: `endoprior.preset('previ"),
+        (lambda: evaluate(scene, Path("DATA")), "sequence: expected a FrameSequence, got 'DATA'. Fix: `endoprior.load"),
+        (lambda: evaluate("RUN", sequence), "scene: expected a trained scene, got 'RUN'. Fix: `endoprior.load_scene('"),
+        (lambda: scene.render(0.5, np.eye(4)), "camera: expected a Camera, got ndarray. Fix: `dataclasses.replace("),
+        (lambda: endoprior.export(scene, "a.ply"), "Fix: Pass --times T with T in [0, 1] (in Python ExportOptions("),
+    ):
+        with pytest.raises(InputError) as raised:
+            call()
+        assert says in str(raised.value) and "\n" not in str(raised.value)
+
+
 def test_only_the_sequence_of_a_scene_is_scored_but_at_any_shrink(make_tiny_sequence):
     folder = make_tiny_sequence("one", num_frames=9)
     scene = train(load_sequence(folder), tiny_config("basis", 0, 1))

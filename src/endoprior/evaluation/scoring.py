@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..compute.parallel_kernels import demand_unforked
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from ..data import FrameSequence, Split
+from ..data import FrameSequence, Split, check_sequence
 from ..model.scene import RenderedScene
 from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext, Reconstruction, SceneFrames
@@ -69,6 +69,10 @@ def evaluate(
         ([1, 9], True)
     """
     demand_unforked()
+    check_sequence(sequence)
+    if isinstance(scene, (str, Path)):
+        name = repr(str(scene))
+        raise input_error("scene", "a trained scene", name, f"`endoprior.load_scene({name})`.")
     rendering: dict[str, str] = {}
     if isinstance(scene, RenderedScene):
         if reading is None:

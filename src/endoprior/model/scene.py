@@ -196,6 +196,7 @@ class Scene(RenderedScene):
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """See `RenderedScene.render`; where two windows show, the weighted mean of the pictures of both."""
+        check_camera(camera)
         seen_by = camera or self.camera_at(time)
         return rendered(self.parts_at(time, seen_by), seen_by, self.backend, self.background)
 
@@ -245,6 +246,13 @@ def with_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> Scene
         fix = "`endoprior render RUN` makes images and a video of it."
         raise input_error(subject, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)
     return scene
+
+
+def check_camera(given: object) -> None:
+    """Raise InputError for what is no camera, such as a matrix; None is that of the frame."""
+    if not isinstance(given, Camera | None):
+        fix = "`dataclasses.replace(scene.camera_at(t), world_to_camera=M)` for a 4 x 4 matrix M."
+        raise input_error("camera", "a Camera", type(given).__name__, fix)
 
 
 def faded_in(place: float) -> float:
