@@ -8,7 +8,7 @@ from torch.nn.functional import avg_pool2d
 
 from endoprior.core.config import Config
 from endoprior.core.ranges import Range
-from endoprior.training.ops import TrainingOps
+from endoprior.training.ops_interface import TrainingOps
 from endoprior.training.own_method import OwnMethod
 from endoprior.training.state import Drawn
 
@@ -25,7 +25,8 @@ class OwnLossConfig(Config):
 
 def areas(drawn: Drawn) -> Tensor:
     """Absolute difference of mean colors over squares of tissue, ()."""
-    error = (drawn.out.color - drawn.frame.rgb) * drawn.frame.tissue_mask[..., None]
+    frame = drawn.frame
+    error = (drawn.out.color - frame.rgb) * frame.counted(frame.tissue_mask)[..., None]
     return avg_pool2d(error.permute(2, 0, 1), AREA_PX).abs().mean()
 
 

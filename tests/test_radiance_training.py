@@ -270,6 +270,9 @@ def test_scores_that_need_gaussians_are_skipped(sequence: FrameSequence, monkeyp
     for name in ("depth_instability_mm", "flow_error_dis_adjacent", "psnr_train"):
         assert found.skipped[name] == context.TOO_SLOW and name not in found.scores
     assert found.protocol["backend"] == "torch, 10 samples per ray"
+    with pytest.raises(InputError, match="expected a scene of Gaussians, got a radiance field"):
+        len(scene)
+    assert scene, "it is there, though it has no length"
 
 
 def test_it_trains_as_a_call_that_another_machine_can_do(sequence: FrameSequence, tmp_path: Path):

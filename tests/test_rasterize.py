@@ -279,19 +279,49 @@ def test_what_is_not_supported_is_said_in_one_line(changes, says):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"quats": torch.zeros(60, 3)}, "quats must have shape"),
-        ({"colors": torch.zeros(2, 60, 16, 3)}, "colors must have shape (1,60,K,3)"),
-        ({"sh_degree": 4}, "sh_degree must be at most 3"),
-        ({"backgrounds": torch.zeros(1, 4)}, "backgrounds must have shape (1,3)"),
-        ({"means": torch.zeros(60, 3, dtype=torch.float64)}, "must share one dtype"),
-        ({"colors": torch.zeros(59, 16, 3)}, "colors must have shape (60,K,3)"),
+        ({"quats": torch.zeros(60, 3)}, "quats: expected shape (60, 4), got (60, 3). Fix: Pass w, x, y, z of each G"),
+        ({"opacities": torch.ones(60, 1)}, "opacities: expected shape (60,), got (60, 1). Fix: `opacities[..., 0]`."),
+        ({"viewmats": torch.eye(4)}, "viewmats: expected shape (C, 4, 4), got (4, 4). Fix: `viewmats[None]` for one"),
+        ({"Ks": torch.eye(3)}, "Ks: expected shape (1, 3, 3), got (3, 3). Fix: `Ks[None]` for one camera."),
+        ({"colors": torch.zeros(2, 60, 16, 3)}, "colors: expected shape (1, 60, K, 3), got (2, 60, 16, 3). Fix: "),
+        ({"colors": torch.zeros(59, 16, 3)}, "colors: expected shape (60, K, 3), got (59, 16, 3). Fix: Pass one ro"),
+        ({"colors": torch.zeros(60, 7, 3)}, "colors: expected 1, 4, 9 or 16 coefficients per channel, got 7. Fix: "),
+        ({"sh_degree": None}, "colors: expected shape (1, 60, D), got (60, 16, 3). Fix: Pass sh_degree=3 for coeff"),
+        ({"colors": torch.zeros(60, 3)}, "colors: expected shape (60, K, 3), got (60, 3). Fix: Leave out sh_degree"),
+        ({"sh_degree": 4}, "sh_degree: expected a whole number from 0 to 3, the degree of colors, got 4. Fix: Pass"),
+        ({"sh_degree": -1}, "sh_degree: expected a whole number from 0 to 3"),
+        ({"backgrounds": torch.zeros(1, 4)}, "backgrounds: expected shape (1, 3), got (1, 4). Fix: Pass one color of"),
+        ({"backgrounds": torch.zeros(3)}, "backgrounds: expected shape (1, 3), got (3,). Fix: `backgrounds[None]` for"),
+        ({"scales": torch.ones(60, 3).double()}, "scales: expected torch.float32, as means has, got torch.float64. Fi"),
+        ({"colors": torch.zeros(60, 16, 3).half()}, "colors: expected torch.float32, as means has, got torch.float16"),
+        ({"means": torch.zeros(60, 3).double(), "backend": None}, "got torch.float64. Fix: `means.float()`."),
+        ({"quats": torch.ones(60, 4, device="meta")}, "quats: expected a tensor on cpu, as means, got meta. Fix: `"),
+        ({"means": np.zeros((60, 3))}, "means: expected a torch.Tensor, got a NumPy array. Fix: `torch.from_numpy(mea"),
+        ({"Ks": [[1.0]]}, "Ks: expected a torch.Tensor, got list. Fix: `torch.tensor(Ks)`."),
+        ({"viewmats": None}, "viewmats: expected a torch.Tensor, got NoneType. Fix: Pass one 4 x 4 matrix of each"),
+        ({"width": 50.0}, "width: expected a whole number of px above 0, got 50.0. Fix: `int(width)`."),
+        ({"height": 0}, "height: expected a whole number of px above 0, got 0. Fix: Pass the size of the image."),
     ],
 )
 def test_what_does_not_fit_is_said_in_one_line(changes, says):
     view = camera()
-    with pytest.raises(ValueError) as raised:
+    with pytest.raises(InputError) as raised:
         endoprior.rasterize(**{**arguments([view], flat(splats(view)), backend="reference"), **changes})
     assert says in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_one_matrix_or_color_for_several_cameras_is_named():
+    views = [camera(seed=0), camera(seed=1)]
+    for name, one in (("Ks", torch.eye(3)), ("backgrounds", torch.zeros(3))):
+        with pytest.raises(InputError, match=rf"Fix: `{name}\.expand\(2, .*\)` for the same in all cameras\.$"):
+            endoprior.rasterize(**{**arguments(views, flat(splats(views[0]))), name: one})
+
+
+def test_a_size_may_be_any_whole_number():
+    view = camera()
+    given = arguments([view], flat(splats(view)), backend="reference")
+    images, _, _ = endoprior.rasterize(**{**given, "width": np.int64(view.width)})
+    assert images.shape == (1, view.height, view.width, 3)
 
 
 def test_options_that_change_nothing_are_taken():

@@ -126,6 +126,45 @@ def test_a_sequence_that_was_opened_without_a_config_is_read_as_the_preset_has_i
     assert scored.scores == again.scores and scored.protocol["shrink"] == 2 and "psnr" in scored.scores
 
 
+def test_a_scene_knows_its_number_of_gaussians_and_is_saved_by_a_name(tiny_sequence, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = train(load_sequence(tiny_sequence), tiny_config("basis", 0, 1))
+    scene.save("a.safetensors")
+    again = endoprior.load_scene("a.safetensors")
+    assert len(again) == len(scene) == len(again.at(0.5).means)
+
+
+def test_a_wrong_argument_is_said_in_one_line(tiny_sequence):
+    sequence, cfg = load_sequence(tiny_sequence), tiny_config("basis", 0, 1)
+    scene = train(sequence, cfg)
+    for call, says in (
+        (lambda: train("DATA", cfg), "sequence: expected a FrameSequence, got 'DATA'. Fix: `endoprior.load_sequence("),
+        (lambda: train(sequence, "preview"), "cfg: expected a Config, got 'preview'. Fix: `endoprior.preset('previ"),
+        (lambda: evaluate(scene, Path("DATA")), "sequence: expected a FrameSequence, got 'DATA'. Fix: `endoprior.load"),
+        (lambda: evaluate("RUN", sequence), "scene: expected a trained scene, got 'RUN'. Fix: `endoprior.load_scene('"),
+        (lambda: scene.render(0.5, np.eye(4)), "camera: expected a Camera, got ndarray. Fix: `dataclasses.replace("),
+        (lambda: endoprior.export(scene, "a.ply"), "Fix: Pass --times T with T in [0, 1] (in Python ExportOptions("),
+    ):
+        with pytest.raises(InputError) as raised:
+            call()
+        assert says in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_only_the_sequence_of_a_scene_is_scored_but_at_any_shrink(make_tiny_sequence):
+    folder = make_tiny_sequence("one", num_frames=9)
+    scene = train(load_sequence(folder), tiny_config("basis", 0, 1))
+    other = make_tiny_sequence("two", num_frames=9, width=56)
+    with pytest.raises(InputError, match=r"two: expected images of 48x40 px, .* got 56x40\. Fix: Pass [^\n]*$"):
+        evaluate(scene, load_sequence(other), networks=False, speed=False)
+    with pytest.raises(InputError, match="got 28x20"):
+        evaluate(scene, load_sequence(other, DataConfig(shrink=2)), networks=False, speed=False)
+    with pytest.raises(InputError, match=r"expected the 9 frames .* got 8\. Fix"):
+        evaluate(scene, load_sequence(folder, DataConfig(first_frames=8)), networks=False, speed=False)
+    for shrink in (2, 3):
+        small = load_sequence(folder, DataConfig(shrink=shrink))
+        assert "psnr" in evaluate(scene, small, networks=False, speed=False).scores
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS.names())
 def test_the_flow_of_the_readme_works_for_every_preset(name, tiny_sequence):

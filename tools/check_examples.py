@@ -1,10 +1,13 @@
-"""Check the types of the Python examples of README and the documentation: `python tools/check_examples.py`.
+"""Check the types of the Python examples of README, the documentation and examples/: `python tools/check_examples.py`.
 
 Each block becomes a file below build/examples, named after its page and line, so that an error of pyright leads there.
+That folder is a project of its own, as a user's: pyright finds endoprior as an installed library, of which only those
+names may be imported from a module that it defines or exports.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -14,7 +17,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+SCRIPTS = sorted(ROOT.glob("examples/*.py"))
 OUT = ROOT / "build" / "examples"
+SETTINGS = {"typeCheckingMode": "standard"}
+"""Pyright's own default; without a file of settings it would take ours, and its search path."""
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PLACE = re.compile(r"`src/([\w/]+)/NAME\.py`")
 """Where a page says that the block after it belongs: what its relative imports start from."""
@@ -45,7 +51,10 @@ def main() -> int:
     OUT.mkdir(parents=True)
     for name, text in (each for page in PAGES for each in examples(page)):
         (OUT / name).write_text(text, encoding="utf-8")
-    words = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, *map(str, sorted(OUT.iterdir()))]
+    for script in SCRIPTS:
+        shutil.copy(script, OUT)
+    (OUT / "pyrightconfig.json").write_text(json.dumps(SETTINGS), encoding="utf-8")
+    words = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--project", str(OUT)]
     return subprocess.run(words, cwd=ROOT, check=False).returncode
 
 

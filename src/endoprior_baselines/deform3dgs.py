@@ -26,7 +26,7 @@ from endoprior.initialization.sampling import PointCloud, concatenated, has_surf
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Field, Motion
 from endoprior.model.offsets import Offsets
-from endoprior.model.ops import ModelOps
+from endoprior.model.ops_interface import ModelOps
 from endoprior.training.optimizer import Rate, rate_of
 
 from .learned_basis import COEFFICIENTS, value_at

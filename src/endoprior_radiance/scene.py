@@ -72,7 +72,7 @@ class RadianceScene(RenderedScene):
         return RenderedView(parts[0].reshape(*size, 3), parts[1].reshape(size), parts[2].reshape(size))
 
     @override
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         arrays = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         arrays |= camera_arrays(self.cameras)
-        save_arrays(path, arrays, scene_facts(self), SCENE_FORMAT)
+        save_arrays(Path(path), arrays, scene_facts(self), SCENE_FORMAT)

@@ -22,7 +22,11 @@ SURE_DEPTH = 0.4  # confidence of a depth that counts as measured, see `Frame.de
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in OpenCV axes (x right, y down, z forward)."""
+    """A pinhole camera in OpenCV axes (x right, y down, z forward).
+
+    `dataclasses.replace(camera, world_to_camera=move @ camera.world_to_camera)` is a moved one. `move` moves the world
+    in camera axes: a translation of (-5, 0, 0) mm puts the camera 5 mm to the right.
+    """
 
     width: int
     """Image width, px."""

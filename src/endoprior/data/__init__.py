@@ -7,7 +7,7 @@ names it, what was expected, what was found and the fix. Only other errors, and 
 from .images import read_depth_file
 from .load import load_sequence
 from .pixels import clean_depth, shrunk
-from .sequence import FrameList, FrameSequence, Split
+from .sequence import FrameList, FrameSequence, Split, check_sequence
 from .stir import nearest_end_errors, write_stir_tracks
 from .truth import RightEye, Truth
 
@@ -17,6 +17,7 @@ __all__ = [
     "RightEye",
     "Split",
     "Truth",
+    "check_sequence",
     "clean_depth",
     "load_sequence",
     "nearest_end_errors",

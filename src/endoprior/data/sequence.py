@@ -348,6 +348,15 @@ class FrameSequence:
         return remarks
 
 
+def check_sequence(given: object) -> None:
+    """Raise InputError unless it is a sequence; a path is not."""
+    if not isinstance(given, FrameSequence):
+        is_path = isinstance(given, (str, Path))
+        got = repr(str(given)) if is_path else type(given).__name__
+        fix = f"`endoprior.load_sequence({got if is_path else 'DATA'})`."
+        raise input_error("sequence", "a FrameSequence", got, fix)
+
+
 def _frame_bytes(frame: Frame) -> int:
     arrays = frame.rgb_u8, frame.tissue_mask, frame.depth, frame.depth_valid, frame.weight, frame.depth_confidence
     return sum(array.nbytes for array in arrays if array is not None)

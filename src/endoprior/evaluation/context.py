@@ -157,9 +157,10 @@ class Evaluation:
         median = float(np.median([value for _, value in scored])) if scored else 0.0
         return [index for index, value in scored if value < median - OUTLIER_DB]
 
-    def save(self, folder: Path) -> Path:
+    def save(self, folder: str | Path) -> Path:
         """Write `metrics.json`, which is returned, and `per_frame.json`; `metrics_SPLIT.json` of another split."""
         suffix = "" if self.protocol["split"] == "test" else f"_{self.protocol['split']}"
+        folder = Path(folder)
         file = folder / f"metrics{suffix}.json"
         facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
         if self.verdict is not None:

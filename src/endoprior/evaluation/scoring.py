@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..compute.parallel_kernels import start_threads
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from ..data import FrameSequence, Split
+from ..data import FrameSequence, Split, check_sequence
 from ..model.scene import RenderedScene
 from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext, Reconstruction, SceneFrames
@@ -56,7 +56,9 @@ def evaluate(
             true path.
         protocols: also score as these papers did, into `Evaluation.protocols`.
     Raises:
-        InputError: the sequence is not the one the scene was trained on (the number of frames differs).
+        InputError: the sequence is not the one the scene was trained on: the number of frames differs, or their size,
+            except by `shrink`. Another sequence of this length and size is scored all the same: `data_fingerprint` in
+            `Evaluation.protocol` and `config.json` of the run tell them apart.
         RuntimeError: this process is a fork of one that has rendered or trained.
 
     Example:
@@ -67,6 +69,10 @@ def evaluate(
         ([1, 9], True)
     """
     start_threads()
+    check_sequence(sequence)
+    if isinstance(scene, (str, Path)):
+        name = repr(str(scene))
+        raise input_error("scene", "a trained scene", name, f"`endoprior.load_scene({name})`.")
     rendering: dict[str, str] = {}
     if isinstance(scene, RenderedScene):
         if reading is None:
@@ -74,6 +80,7 @@ def evaluate(
         if len(sequence) != len(scene.cameras):
             expected = f"the {len(scene.cameras)} frames the scene was trained on"
             raise input_error(sequence.path, expected, str(len(sequence)), "pass the same sequence.")
+        _reject_other_size(scene, sequence)
         sequence = sequence.with_poses(scene.cameras)  # in which it was trained; they may have been estimated again
         frames, reading = SceneFrames(scene, sequence), reading or scene.config.data
         fps = f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
@@ -101,6 +108,20 @@ def evaluate(
     result.protocol["tags"] = tags_of(OURS, context, sequence.indices(split), sequence.mask_folder, reading.shrink)
     result.protocols = score_protocols(protocols, context, scored_data(reading))
     return result
+
+
+def _reject_other_size(scene: RenderedScene, sequence: FrameSequence) -> None:
+    """Raise InputError where the images are not those of the scene's cameras, nor the same ones shrunk otherwise."""
+    ours, theirs = scene.cameras[0], sequence.camera(0)
+    if (ours.width, ours.height) == (theirs.width, theirs.height):
+        return
+    shrink = scene.config.data.shrink
+    other = shrink if sequence.reading is None else sequence.reading.shrink
+    # Blocks of n x n px: an image of w px was n w to n w + n - 1 px wide.
+    pairs = ((ours.width, theirs.width), (ours.height, theirs.height))
+    if not all(max(shrink * a, other * b) < min(shrink * (a + 1), other * (b + 1)) for a, b in pairs):
+        expected = f"images of {ours.width}x{ours.height} px, on which the scene was trained"
+        raise input_error(sequence.path, expected, f"{theirs.width}x{theirs.height}", "pass the same sequence.")
 
 
 def scored_data(trained: DataConfig) -> DataConfig:

@@ -96,7 +96,8 @@ def _write_time_steps(
         if len(steps) != 1:
             moving = [other for other in same_suffix if load_format(other).write]
             instead = "".join(f", or --format {other} for all of them" for other in moving)
-            fix = f"Pass --times T with T in [0, 1], or a folder instead of a file{instead}."
+            times = "--times T with T in [0, 1] (in Python ExportOptions(times=(T,)))"
+            fix = f"Pass {times}, or a folder instead of a file{instead}."
             raise input_error(out, "one time step for one file", f"{len(steps)}", fix)
         contents = files(scene, steps[0], options)
         _check_file(out, tuple(contents), name)

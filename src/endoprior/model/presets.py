@@ -18,7 +18,8 @@ def preset(name: str = "default", **changes: Any) -> Config:
     """The config of a preset: `preset("default", iterations=3000, seed=1)`.
 
     Args:
-        changes: other values, by names that `Config.replace` knows; `iterations` changes the whole schedule.
+        changes: other values, by names that `Config.replace` knows; `iterations` changes the whole schedule,
+            `gaussians` is how many there are at the start: training may add more and remove some.
     Raises:
         InputError: no preset or field has this name, or a value has the wrong type or range.
 

@@ -47,7 +47,7 @@ class RenderedScene(ABC):
         """
 
     @abstractmethod
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the scene as safetensors, completely or not at all.
 
         Raises:
@@ -64,6 +64,18 @@ class RenderedScene(ABC):
         Raises:
             ValueError: time is not in [0, 1].
         """
+
+    def __bool__(self) -> bool:
+        """A scene without any Gaussians is a scene too."""
+        return True
+
+    def __len__(self) -> int:
+        """Number of Gaussians in all windows.
+
+        Raises:
+            InputError: it is a radiance field, which has none.
+        """
+        raise no_gaussians(self)
 
     def at(self, time: float, camera: Camera | None = None) -> Splats:
         """The Gaussians at `time`, activated; see `Scene.at`.
@@ -95,3 +107,10 @@ def no_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> InputEr
     """The error, which names `subject`, where Gaussians are needed and the scene is a radiance field."""
     fix = "`endoprior render RUN` makes images and a video of it."
     return input_error(subject, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)
+
+
+def check_camera(given: object) -> None:
+    """Raise InputError for what is no camera, such as a matrix; None is that of the frame."""
+    if not isinstance(given, Camera | None):
+        fix = "`dataclasses.replace(scene.camera_at(t), world_to_camera=M)` for a 4 x 4 matrix M."
+        raise input_error("camera", "a Camera", type(given).__name__, fix)

@@ -29,7 +29,7 @@ from .motion import Field, Motion
 from .offsets import Offsets
 from .ops import ops_for
 from .photometric import between, is_possible
-from .rendered_scene import RenderedScene, no_gaussians
+from .rendered_scene import RenderedScene, check_camera, no_gaussians
 from .scene_facts import MOST_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand, scene_facts
 
 
@@ -114,6 +114,7 @@ class Scene(RenderedScene):
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """See `RenderedScene.render`; where two windows show, the weighted mean of the pictures of both."""
+        check_camera(camera)
         seen_by = camera or self.camera_at(time)
         return rendered(self.parts_at(time, seen_by), seen_by, self.backend, self.background)
 
@@ -288,7 +289,7 @@ class SingleScene(Scene):
             depth_noise=facts.depth_noise,
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """See `Scene.save`."""
         if self.field is not None and self.field.grid is not None and self.field.grid.values.dtype != torch.float32:
             raise ValueError("save the scene itself, not a copy with fp16 planes")
@@ -306,7 +307,7 @@ class SingleScene(Scene):
             arrays["tissue"], about["tissue"] = self.tissue, True
         if self.depth_noise:
             about["depth_noise"] = self.depth_noise
-        save_arrays(path, arrays, scene_facts(self) | about, SCENE_FORMAT)
+        save_arrays(Path(path), arrays, scene_facts(self) | about, SCENE_FORMAT)
 
 
 def with_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> Scene:

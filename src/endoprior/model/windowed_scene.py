@@ -84,8 +84,9 @@ class WindowedScene(Scene):
         windows = self.windows
         return replace(self, read=lambda k: change(windows[k].scene, windows[k]))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """See `Scene.save`: the list of windows, and the windows below `windows/` beside it."""
+        path = Path(path)
         for k, window in enumerate(self.windows):
             file = window_file(path, k)
             file.parent.mkdir(parents=True, exist_ok=True)

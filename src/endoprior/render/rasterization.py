@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from ..core.checks import check_shape, input_error, or_did_you_mean
+from ..core.checks import input_error, or_did_you_mean
 from ..core.types import LEAST_ALPHA, Camera, Splats
 from . import load, sh
+from .arguments import check_arguments
 from .autograd import Composite, Project, Tensors
 from .constants import BLUR_PX2, NEAR_Z
 from .projection import Projected, check, project, unit
@@ -109,8 +110,8 @@ def rasterize(
         (C, N, 2) px, whose gradient can be kept with `retain_grad()`, `radii` (C, N, 2) px, 0 where culled, `depths`
         (C, N), `opacities` (C, N), `width`, `height`, `n_cameras`, and None as `camera_ids` and `gaussian_ids`.
     Raises:
-        InputError: an option that is not supported, a view that is not rigid, or intrinsics with skew.
-        ValueError: shapes, types or devices do not fit.
+        InputError: shapes, types or devices do not fit, an option is not supported, a view is not rigid, or intrinsics
+            have skew.
 
     Example:
         >>> import torch, endoprior
@@ -123,7 +124,9 @@ def rasterize(
         >>> image.sum().backward()
     """
     _reject(options, render_mode, near_plane, far_plane)
-    num_channels = _check(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    given |= {"viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds}
+    num_channels = check_arguments(given, sh_degree, (width, height), backend)
     scale = NEAR_Z / near_plane
     cameras = _cameras(viewmats, Ks, width, height, scale)
     if backgrounds is None:
@@ -179,33 +182,6 @@ def _reject(options: dict[str, Any], render_mode: str, near_plane: float, far_pl
     if not 0 < near_plane < far_plane:
         got = f"{near_plane!r} and {far_plane!r}"
         raise input_error("near_plane, far_plane", "0 < near_plane < far_plane", got, "leave them out.")
-
-
-def _check(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    sh_degree: int | None,
-    backgrounds: Tensor | None,
-) -> int:
-    """Raise an error where shapes disagree; the number of channels of a color."""
-    views = {"viewmats": viewmats, "Ks": Ks}
-    shapes = "means:N,3 quats:N,4 scales:N,3 opacities:N viewmats:C,4,4 Ks:C,3,3"
-    sizes = check_shape(shapes, means=means, quats=quats, scales=scales, opacities=opacities, **views)
-    each = "D" if sh_degree is None else "K,3"
-    per_camera = colors.dim() == each.count(",") + 3
-    wanted = f"colors:{'C,' if per_camera else ''}N,{each}".replace("C", str(sizes["C"])).replace("N", str(sizes["N"]))
-    found = check_shape(wanted, colors=colors)
-    num_channels = found.get("D", 3)
-    if sh_degree is not None and sh.degree_of(found["K"]) < sh_degree:
-        raise ValueError(f"sh_degree must be at most {sh.degree_of(found['K'])}, which colors have; got {sh_degree}")
-    if backgrounds is not None:
-        check_shape(f"backgrounds:{sizes['C']},{num_channels}", backgrounds=backgrounds)
-    return num_channels
 
 
 def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, scale: float) -> list[Camera]:

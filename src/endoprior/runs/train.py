@@ -16,7 +16,7 @@ from ..check.errors import find_errors
 from ..compute.parallel_kernels import start_threads
 from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config
-from ..data import FrameSequence, load_sequence
+from ..data import FrameSequence, check_sequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
 from ..model.method import method_of
 from ..model.scene import RenderedScene, SingleScene
@@ -98,6 +98,10 @@ def train(
         sequence = load_sequence(sequence_of_run(Path(out)), cfg.data) if sequence is None else sequence
     if sequence is None or cfg is None:
         raise ValueError("train needs a sequence and a config; only with resume=True and out it takes those of the run")
+    check_sequence(sequence)
+    if not isinstance(cfg, Config):
+        fix = f"`endoprior.preset({cfg!r})`." if isinstance(cfg, str) else "`endoprior.preset('default')`."
+        raise input_error("cfg", "a Config", repr(cfg) if isinstance(cfg, str) else type(cfg).__name__, fix)
     if progress is None:
         progress = is_watched()
     run = start_run(sequence, cfg, out, resume=resume, say=complain if progress else log.info)
