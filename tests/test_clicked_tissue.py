@@ -10,8 +10,7 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask
-from endoprior.tool_masks.clicked_tissue import free_clicked
-from endoprior.tool_masks.clicked_tools import ToolClick
+from endoprior.tool_masks.clicked_tools import ToolClick, free_clicked
 
 HEIGHT, WIDTH, FRAMES = 96, 128, 7
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.core.strain import Strain
+from endoprior.core.geometry import Strain
 from endoprior.data import load_sequence
 from endoprior.data.truth import Deformation
 from endoprior.evaluation.scorers.deformation import (

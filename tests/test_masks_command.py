@@ -105,7 +105,8 @@ def test_a_dataset_whose_reader_takes_no_masks_of_this_size_stays_as_it_is(tmp_p
     camera = sequence.camera(0)
     with pytest.raises(InputError, match="one mask file per frame"):
         replace_masks(sequence, dict.fromkeys(range(3), np.zeros((camera.height, camera.width), bool)))
-    monkeypatch.setattr("endoprior.tool_masks.sequence.find_in_sequence", lambda *args, **more: pytest.fail("searched"))
+    search = "endoprior.tool_masks.mask_store.find_in_sequence"
+    monkeypatch.setattr(search, lambda *args, **more: pytest.fail("searched"))
     assert main(["masks", str(tmp_path / "DATA")]) == 2
     assert "one mask file per frame" in capsys.readouterr().err
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before

@@ -23,12 +23,9 @@ from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.camera_path.even_view import EvenView, Warp, matrix_at
 from endoprior.prepare.camera_path.partners import LEAST_DEGREES, MOST_DEGREES, choose_partners, parallax
 from endoprior.prepare.frames import WORK
-from endoprior.prepare.parallax.consistency import checked
 from endoprior.prepare.parallax.correlation import correlation
-from endoprior.prepare.parallax.filling import bent
-from endoprior.prepare.parallax.measure import measure_depth
-from endoprior.prepare.parallax.semi_global import DIRECTIONS, aggregated
-from endoprior.prepare.parallax.sweep import peak, scaled_size
+from endoprior.prepare.parallax.measure import bent, checked, measure_depth
+from endoprior.prepare.parallax.sweep import DIRECTIONS, aggregated, peak, scaled_size
 from endoprior.training.frames import TrainingFrames
 
 SIZE = (WIDTH, HEIGHT)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endoprior.prepare.scale.cylinder import axis_of, ray_at
-from endoprior.prepare.scale.shaft import TipReading, frontier, tip_readings
+from endoprior.prepare.scale.shaft import TipReading, axis_of, frontier, ray_at, tip_readings
 from endoprior.prepare.scale.shaft_edges import line_through, shafts_of
 
 HEIGHT, WIDTH, RADIUS = 256, 320, 4.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endoprior.core.strain import strain_between
+from endoprior.core.geometry import strain_between
 from endoprior.phantom.sheet import NoEquilibrium, Sheet, offset, tangents
 
 THICKNESS = 2.0

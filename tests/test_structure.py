@@ -108,7 +108,7 @@ def test_a_method_of_another_package_needs_public_names_only():
 
 
 def test_modules_of_compute_serve_several_packages():
-    """What one package uses belongs into that package; `lane_types` is a part of `simd`."""
+    """What one package uses belongs into that package."""
     users: dict[str, set[str]] = {path.stem: set() for path in (SRC / "compute").glob("[!_]*.py")}
     for path in ALL_FILES:
         parts = path.relative_to(ROOT / "src").parts
@@ -117,7 +117,7 @@ def test_modules_of_compute_serve_several_packages():
             module = node.module or "" if isinstance(node, ast.ImportFrom) else ""
             if found := re.search(r"\bcompute\.(\w+)", module):
                 users[found[1]].add(package)
-    assert {name for name, packages in users.items() if len(packages) < 2} == {"lane_types"}
+    assert {name for name, packages in users.items() if len(packages) < 2} == set()
 
 
 def circles(types: bool) -> list[set[str]]:

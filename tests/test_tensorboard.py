@@ -9,8 +9,7 @@ from tiny_training import tiny_config
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
-from endoprior.runs.log import read_log
-from endoprior.runs.tensorboard import EVENTS, EventFiles
+from endoprior.runs.log import EVENTS, EventFiles, read_log
 from endoprior.runs.train import train
 
 

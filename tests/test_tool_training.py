@@ -16,11 +16,10 @@ from endoprior_studies.tool_training import benchmark, camera, composites, foota
 from endoprior_studies.tool_training.benchmark import Counts, TestFrame, count, pictures, score_set
 from endoprior_studies.tool_training.camera import photographed, random_view
 from endoprior_studies.tool_training.composites import IGNORED, SIZE, LabeledFrame, examples
-from endoprior_studies.tool_training.fit import RATE, Examples, fit, loss_of, rate_of
+from endoprior_studies.tool_training.fit import RATE, Examples, fit, loss_of, pretrained, rate_of
 from endoprior_studies.tool_training.foreign_bodies import gauze, needle, ribbed_tube
 from endoprior_studies.tool_training.instruments import NEAR_WIDTH_PX, instrument
 from endoprior_studies.tool_training.noise import fractal_field, smooth_field
-from endoprior_studies.tool_training.pretrained import pretrained
 from endoprior_studies.tool_training.scope_tools import cap, catheter, clips
 from endoprior_studies.tool_training.tissue import LIT_PARTS, MATTE_PARTS, tissue
 

@@ -4,11 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.prepare.camera_path import tube
+from endoprior.prepare.camera_path import shape
 from endoprior.prepare.camera_path.path_facts import MOST_RATIO
-from endoprior.prepare.camera_path.shape import axial_cosine
+from endoprior.prepare.camera_path.shape import axial_cosine, shape_by_light
 from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
-from endoprior.prepare.camera_path.tube import shape_by_light
 from endoprior.prepare.relative_depth import fit_shading
 
 SIZE = WIDTH, HEIGHT = 160, 128
@@ -44,7 +43,7 @@ def error(z, truth, where=EVERYWHERE):
 
 
 def test_a_tube_lit_by_a_lamp_at_the_camera_gives_its_depth_back(monkeypatch):
-    monkeypatch.setattr(tube, "EXPONENT", 1 / 3)  # exact in a tube without folds
+    monkeypatch.setattr(shape, "EXPONENT", 1 / 3)  # exact in a tube without folds
     z, distance, cos_slope = straight_tube()
     frames = [shaded(lit(distance, cos_slope, gain)) for gain in (250, 300, 350)]
     found = shape_by_light(frames, COSINE)

@@ -17,8 +17,8 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from endoprior.compute.fastmath import REORDERED
 from endoprior.compute.parallel_kernels import parallel_njit
+from endoprior.compute.simd import REORDERED
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage

@@ -17,7 +17,7 @@ from endoprior.data.writer import BACKUP, POSES, note_found_masks, write_mask
 from endoprior.evaluation.true_masks import SCORES_FILE, TrueMasks, score_masks
 from endoprior.prepare.folder_path import write_folder_path
 from endoprior.system.atomic import whole_folder, write_json
-from endoprior.tool_masks.sequence import find_in_sequence
+from endoprior.tool_masks.mask_store import find_in_sequence
 
 from .spec import SequenceSpec
 

@@ -43,9 +43,8 @@ class Export(ExportOptions, Command):
     def execute(self) -> None:
         """Export."""
         from ..export import export
-        from ..export.exporting import format_name
+        from ..export.exporting import format_name, loss_note
         from ..export.formats import load_format
-        from ..export.loss import loss_note
 
         given = {each.name: getattr(self, each.name) for each in fields(ExportOptions)}
         scene = open_gaussians(self.run)

@@ -77,7 +77,7 @@ class Masks(Command):
         from ..data.found_tools import FrameRow, uncertain_frames, write_rows
         from ..data.writer import note_found_masks
         from ..prepare.networks import open_sam2
-        from ..tool_masks.sequence import find_in_sequence
+        from ..tool_masks.mask_store import find_in_sequence
         from ..tool_masks.video_segmenter import segment_sequence
 
         rows, segmenter = list[FrameRow](), None
@@ -100,8 +100,7 @@ class Masks(Command):
     def _correct(self, sequence: FrameSequence) -> None:
         """Add the tools at the points of `--tool` to the masks of all frames, or free the tissue at `--tissue`."""
         from ..data.found_tools import read_rows, write_rows
-        from ..tool_masks.clicked_tissue import free_clicked
-        from ..tool_masks.clicked_tools import find_clicked, parse_click
+        from ..tool_masks.clicked_tools import find_clicked, free_clicked, parse_click
         from ..tool_masks.mask_store import MaskStore
 
         adds = bool(self.tool)

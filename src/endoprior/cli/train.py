@@ -138,9 +138,8 @@ class Train(Command):
 
     def train_and_score(self, cfg: Config) -> None:
         """Train with this config, write the run folder, score the test split, print the scores."""
-        from ..runs.log import missed_tools_line, read_log
+        from ..runs.log import EventFiles, missed_tools_line, read_log
         from ..runs.remote import complete_on
-        from ..runs.tensorboard import EventFiles
         from ..runs.train import start_run
         from ..system.ray_cluster import connected
         from ..training.trainer import device_for

@@ -21,7 +21,7 @@ from .paths import open_gaussians, sequence_if_there
 
 if TYPE_CHECKING:
     from ..training.trainer import Observer
-    from ..view.viewables import Viewable
+    from ..view.viewable_sequence import Viewable
 
 
 @dataclass

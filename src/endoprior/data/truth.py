@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
-from ..core.geometry import FARTHEST_MM
-from ..core.strain import Strain
+from ..core.geometry import FARTHEST_MM, Strain
 from .description import LEAST, MOST, is_number
 from .files import IMAGE_SUFFIXES, files_with, read_json
 from .frame_files import match_names

@@ -1,4 +1,4 @@
-"""Write a scene in one of the formats, whole or not at all."""
+"""Write a scene in one of the formats, whole or not at all, and compare what was written with the scene."""
 
 from __future__ import annotations
 
@@ -6,13 +6,23 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import render
 from ..core.checks import input_error
 from ..core.geometry import length_unit
+from ..core.ranges import evenly_spaced
+from ..core.types import Splats
+from ..model.scene import Scene
 from ..system.atomic import whole_file, whole_folder, write_json
+from .axes import ROTATIONS, rotated
 from .formats import REGISTRY, ExportFormat, ExportOptions, Files, Progress, formats_of, load_format, usable_formats
+from .time_steps import TimeStep, selected_time_steps
 
 if TYPE_CHECKING:
-    from ..model.scene import RenderedScene, Scene
+    from ..model.scene import RenderedScene
 
 
 def format_name(out: Path, options: ExportOptions) -> str:
@@ -131,3 +141,42 @@ def _check_file(out: Path, suffixes: tuple[str, ...], name: str) -> None:
     except OSError as error:
         want = "a place where a file can be written"
         raise input_error(out, want, f"{error.strerror}", "Choose another place.") from error
+
+
+MOST_FRAMES = 3
+INVISIBLE_DB = 60.0
+"""At this PSNR the error is a quarter of a step of 8 bits."""
+
+
+def loss_note(scene: Scene, out: Path, options: ExportOptions, chosen: ExportFormat) -> str:
+    """PSNR of a few of the files just written against the scene, in one line; empty for a format that is not read.
+
+    Both are rendered as the endoscope sees them, without smoke.
+    """
+    if chosen.read is None:
+        return ""
+    steps = selected_time_steps(scene, options)
+    some = [steps[k] for k in evenly_spaced(len(steps), MOST_FRAMES)]
+    back = ROTATIONS[options.frame or chosen.default_axes].T
+    errors = []
+    for step in some:
+        file = out / f"{step.name}{chosen.suffixes[0]}" if out.is_dir() else out
+        found = _rendered(scene, step, rotated(chosen.read(file.read_bytes()), back))
+        errors.append(float(((found - _as_trained(scene, step)) ** 2).mean()))
+    psnr = float(-10 * np.log10(max(np.mean(errors), 1e-12)))
+    count = "the image" if len(some) == 1 else f"{len(some)} images"
+    result = f"{psnr:.1f} dB" if psnr < INVISIBLE_DB else f"over {INVISIBLE_DB:.0f} dB, no visible difference"
+    why = "; one color for each Gaussian (docs/export.md)" if scene.config.render.color_slopes else ""
+    return f"the file shows {count} of the scene with a PSNR of {result}{why}."
+
+
+def _as_trained(scene: Scene, step: TimeStep) -> Tensor:
+    if step.canonical:
+        return _rendered(scene, step, step.splats(scene, "opencv"))
+    return scene.render(step.time, step.camera(scene)).color.cpu()
+
+
+@torch.no_grad()
+def _rendered(scene: Scene, step: TimeStep, splats: Splats) -> Tensor:
+    background = torch.tensor(scene.background, dtype=splats.means.dtype)
+    return render.load("numba")(splats, step.camera(scene), background=background).color.clamp(0, 1)

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ..core.geometry import back_project, pixel_centers, unit_vectors
-from ..core.strain import Strain, strain_of
+from ..core.geometry import Strain, back_project, pixel_centers, strain_of, unit_vectors
 from ..core.types import Camera
 from .carry import carry_points
 from .scene import Scene

@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import interpolate
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 from ..core.types import RenderedView
 
 GRID = (18, 24)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.strain import strain_between
+from ..core.geometry import strain_between
 from ..data.sequence import is_test_frame
 from ..data.writer import FrameFiles, SequenceMeta, new_sequence
 from .camera import STILL, Eye

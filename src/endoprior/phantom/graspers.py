@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 from .instrument_shapes import cylinder
 from .shading import HIGHLIGHT_LIMIT, REFERENCE_MM, ggx
 

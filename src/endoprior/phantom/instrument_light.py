@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..compute.fastmath import REORDERED
+from ..compute.simd import REORDERED
 from .shading import HIGHLIGHT_LIMIT, REFERENCE_MM, ggx
 
 

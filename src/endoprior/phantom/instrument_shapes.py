@@ -12,7 +12,7 @@ from math import hypot, pi
 import numpy as np
 from numba import njit
 
-from ..compute.fastmath import REORDERED
+from ..compute.simd import REORDERED
 
 SHAFT, JAWS, UPPER, LOWER = 0, 1, 2, 3
 """The axes a part is in: those of the shaft, of the jaws, of one jaw turned by half the opening, and of the other."""

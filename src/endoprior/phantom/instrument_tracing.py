@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 from .camera import STILL, Eye
 from .graspers import draw_graspers
 from .instrument_light import Material, paint_at, radiance_at

@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 
 
 @njit(cache=True, inline="always")

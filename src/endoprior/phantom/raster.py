@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 
 _BANDS = 16
 _RIM = np.float32(1e-4)  # triangles are widened by this, so that samples on a shared edge belong to one of the two

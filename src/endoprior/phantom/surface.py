@@ -15,8 +15,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 from .config import PhantomConfig
 from .noise import fractal
 

@@ -2,9 +2,8 @@
 
 from .batch import SUMMARY, TABLE, Entry, Outcome, run_here, run_on, write_summary
 from .forecast import COMPILE, Forecast, parts_of
-from .handed_on import HandedOn
 from .job import Job, SequenceJob, make_job, open_folder, removed_if_rejected
-from .steps import STEPS, Step, notes_of, problems, run_step, steps_of, verdict_of
+from .steps import STEPS, HandedOn, Step, notes_of, problems, run_step, steps_of, verdict_of
 
 __all__ = [
     "COMPILE",

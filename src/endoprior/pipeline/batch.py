@@ -22,9 +22,8 @@ from ..runs.train import WindowedRun
 from ..system.atomic import write_text
 from ..system.devices import Threads
 from ..system.ray_cluster import Cluster
-from .handed_on import HandedOn
 from .job import SequenceJob, open_folder
-from .steps import SHOWN_SCORES, run_step, start_training, steps_of, verdict_of
+from .steps import SHOWN_SCORES, HandedOn, run_step, start_training, steps_of, verdict_of
 
 FAILURE = "failure.txt"  # in the folder of a job: the traceback, if it failed by an error of the program
 SUMMARY, TABLE = "summary.md", "scores.csv"

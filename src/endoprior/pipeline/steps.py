@@ -1,11 +1,15 @@
-"""The steps of a job. A step whose result is there is skipped, so that an interrupted job resumes."""
+"""The steps of a job. A step whose result is there is skipped, so that an interrupted job resumes.
+
+What a step hands on to later ones (`HandedOn`) lives as long as the process: nothing is computed twice. A step that
+finds nothing there, because the job was interrupted, computes it itself, with the same result.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from textwrap import wrap
@@ -31,6 +35,7 @@ from ..evaluation.scoring import evaluate, scored_data
 from ..evaluation.verdict import Verdict, VerdictFacts, verdict_on
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
 from ..footage.components import runs
+from ..footage.known_facts import KnownFacts
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
@@ -48,8 +53,18 @@ from ..visualization.image_tools import colorize, label, tile
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
 from .choice import SCAN
-from .handed_on import HandedOn
 from .job import Job, SequenceJob
+
+
+@dataclass
+class HandedOn:
+    """Empty at first."""
+
+    facts: KnownFacts = field(default_factory=KnownFacts)  # of the prepared frames; from `prepare` to `check`
+    sequence: FrameSequence | None = None
+    """As the training reads it, with the frames that it holds decoded; from `check` to `train`."""
+    rendered: RenderedFrames | None = None  # the frames as the scene renders them; from `score` to `video`
+
 
 PICTURE_BYTES = 60  # memory in which a thread composes an image of the video, bytes for each px of a frame
 PLAYER_BYTES = 40_000_000  # largest player

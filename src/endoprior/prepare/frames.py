@@ -38,7 +38,7 @@ from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
 
 if TYPE_CHECKING:
-    from ..tool_masks.sequence import Progress
+    from ..tool_masks.mask_store import Progress
     from ..tool_masks.video_segmenter import VideoSegmenter
 
 REACH = 2  # number of frames on each side in the temporal depth filter

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.optim.adam import adam
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
-from ..compute.simd import LANES, prefetch
+from ..compute.simd import LANES, REORDERED, prefetch
 from ..model.hexplane import FRESH, TOUCHED, PlaneGrid
 from ..model.offsets import RankOneGradient, UnstoredGradient
 

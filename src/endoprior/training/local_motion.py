@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..compute.fastmath import REORDERED
 from ..compute.neighbors import MAX_COORDINATE, nearest
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 from ..core.checks import check_shape
 
 NUM_NEIGHBORS = 8  # K

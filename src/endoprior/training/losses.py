@@ -16,8 +16,8 @@ from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..compute.fastmath import REORDERED
 from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import REORDERED
 from ..core.config import LossConfig
 from ..core.types import RenderOutput
 from .frames import TrainingFrame

@@ -24,8 +24,8 @@ from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..system.memory import BoundedCache, cache_bytes
 from ..tool_masks import ToolFinder
+from ..tool_masks.mask_store import view_of
 from ..tool_masks.regions import disk, entering_regions, filled
-from ..tool_masks.sequence import view_of
 from .frames import TrainingFrame
 
 WORK_PX = 160  # longer side of the resized image, px: a shaft is about 12 px wide, a jaw 3

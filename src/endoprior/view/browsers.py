@@ -20,7 +20,7 @@ from .viewport import Viewport, bounded_aspect, endoscope_viewport, free_viewpor
 if TYPE_CHECKING:
     import viser
 
-    from .viewables import Viewable
+    from .viewable_sequence import Viewable
 
 PREVIEW_QUALITY = 80
 """JPEG quality of images while something moves; static images are PNG (lossless)."""

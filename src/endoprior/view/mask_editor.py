@@ -18,8 +18,7 @@ from ..data import FrameSequence
 from ..data.found_tools import drop_rows
 from ..data.writer import replace_masks
 from ..footage.carry_masks import CarriedEdit, carry_mask_edit
-from ..tool_masks.clicked_tissue import free_clicked
-from ..tool_masks.clicked_tools import SearchStep, ToolClick, find_clicked
+from ..tool_masks.clicked_tools import SearchStep, ToolClick, find_clicked, free_clicked
 from .incoming import BRUSH_NODE, JobQueue
 
 if TYPE_CHECKING:

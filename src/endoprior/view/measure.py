@@ -23,7 +23,7 @@ from .panel import AREA, DISPLACEMENT, DISTANCE, PATH, POINTS_OF, STRETCH, Panel
 from .viewable import FollowedPoints, ViewSettings
 
 if TYPE_CHECKING:
-    from .viewables import Viewable
+    from .viewable_sequence import Viewable
 
 SURE = 0.5
 """Least confidence of a track that is not drawn faded."""

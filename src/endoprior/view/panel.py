@@ -18,7 +18,7 @@ from .viewable import Layer, ViewSettings
 if TYPE_CHECKING:
     import viser
 
-    from .viewables import Viewable
+    from .viewable_sequence import Viewable
 
 LAYER_NAMES: dict[Layer, str] = {
     "color": "Color",

@@ -46,7 +46,7 @@ from .viewable import IDLE_SECONDS, ViewSettings, frame_due
 from .viewport import PathPoint, Viewport, endoscope_viewport, follow_frames, interpolate
 
 if TYPE_CHECKING:
-    from .viewables import Viewable
+    from .viewable_sequence import Viewable
 
 MAX_KEPT = 100
 """Largest number of saved views."""

@@ -18,6 +18,7 @@ from ..visualization.image_tools import colorize
 from . import layers
 from .mask_editor import MaskEdits
 from .viewable import Cloud, FollowedPoints, Layer, ViewSettings
+from .viewable_scene import ViewableScene
 
 MAX_POINTS = 100_000
 """Largest number of points sent to a browser per frame; larger images are subsampled."""
@@ -141,3 +142,6 @@ class ViewableSequence:
         """Meaning of the colors in one line; empty for plain color."""
         depth = "blue {:.1f} to red {:.1f} {}".format(*self.span, length_unit(self.relative))
         return {"depth": depth, "prior": "joint texture prior: blue 0 to red 1"}.get(settings.layer, "")
+
+
+Viewable = ViewableScene | ViewableSequence

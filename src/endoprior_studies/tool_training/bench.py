@@ -45,8 +45,8 @@ def run(argv: list[str]) -> int:
     from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
 
+    from .fit import pretrained
     from .leave_one_out import ALL, Training, rows, weights_file, write_report
-    from .pretrained import pretrained
 
     require_writable_folder("OUT", args.out)
     start = pretrained(args.pretrained, args.seed) if args.pretrained else None

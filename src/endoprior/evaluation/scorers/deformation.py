@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.geometry import camera_to_world, cells_at, project
-from ...core.strain import Strain
+from ...core.geometry import Strain, camera_to_world, cells_at, project
 from ...data import FrameSequence
 from ...footage.components import distance_inside
 from ...model.carry import carry_points

@@ -30,9 +30,8 @@ from .kind import path_motion
 from .own import own_path
 from .pose_file import MM_PER_M, is_model, is_text, read_model_poses, read_poses, read_text_poses
 from .refine import refined_path
-from .shape import DepthShape, axial_cosine, fitted_shape
+from .shape import DepthShape, axial_cosine, fitted_shape, shape_by_light
 from .tracks import DEPTH_STD, CameraPath, PoseInput, TrackingCamera, Tracks
-from .tube import shape_by_light
 
 BYTES_PER_PX = 60  # memory in which a thread compares two frames, bytes for each px
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)

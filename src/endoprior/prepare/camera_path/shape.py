@@ -5,18 +5,99 @@ lamp and with the cosine of the slope, and how much of either counts differs bet
 camera drives ahead, triangulated points say it: a power of the depth for the whole clip, log r = power * log d +
 constant, and what is left at the points of each frame, spread over pixels of like depth around them. The lamp is at the
 camera: r is the length of the ray, and z its part along the axis.
+
+In a tube (colon, bronchus) where no points are triangulated, the light says it. A lamp at the camera lights a surface
+with I = cos(slope) / r^2, and cos(slope) = D / r with the distance D of its tangent plane. D is the same for all of a
+plane and of a straight tube around the camera: r = (D / I)^(1/3) gives both back; tissue that faces the lamp has r =
+I^(-1/2). In a tube the wall recedes into one dark place and gets brighter in all directions from it; elsewhere a dark
+place is a shadow or a hole, and its surroundings are of any brightness.
+
+`h, w` size of the small images.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .follow import Follower
 from .path_facts import DepthShape
-from .tracks import CameraPath, TrackingCamera
+from .tracks import CameraPath, PoseInput, TrackingCamera
+
+EXPONENT = 0.45  # of 1 / I, for r: between the two; phantoms of three seeds are best at 0.45 to 0.5
+SHADED = 0.7  # share of the variance of log depth that brightness explains, if the depth is one from shading
+SMALL_WIDTH, BLUR_PX = 80, 1.5  # w and the smoothing, px: vessels and grain are no tube
+DARK_PERCENT = 2.0  # of the tissue, for the dark place
+DARKER = 0.8  # log by which it is darker than the median of the tissue; phantoms: 1.0 to 2.8
+SECTORS, FEWEST_PX = 12, 30  # directions around the dark place, and px that one needs to count
+RISES = 0.5  # correlation of log brightness and log distance from which on a direction gets brighter
+MOST_RISE = 0.8  # share of the directions that do; phantoms of three seeds: 0.86 to 1
+OFTEN = 0.5  # share of the frames that look so
+
+
+Image, Mask = NDArray[np.uint8], NDArray[np.bool_]
+
+
+def shape_by_light(frames: Iterable[PoseInput], cosine: NDArray[np.float32]) -> DepthShape | None:
+    """The shape of depth from shading in a tube; None if at most half of the frames show one, or depth has another
+    source. Depth that has the shape already stays. Args: cosine: (H, W) of `shape.axial_cosine`.
+    """
+    recedes, light, depth, number = [], [], [], []
+    for k, seen in enumerate(frames):
+        bright, usable = _brightness(seen.rgb_u8, seen.tissue_mask)
+        recedes.append(_recedes(bright, usable))
+        near = cv2.resize(seen.depth, usable.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        usable &= near > 0
+        light.append(bright[usable])
+        depth.append(near[usable])
+        number.append(np.full(usable.sum(), k))
+    if not recedes or np.mean(recedes) <= OFTEN:
+        return None
+    frame, depths = np.concatenate(number), np.concatenate(depth).astype(np.float64)
+    x, y = (without_means(v, frame, len(recedes)) for v in (np.concatenate(light), np.log(depths)))
+    slope, clear = robust_slope(x, y)
+    power = -EXPONENT / slope if slope < 0 else 0.0
+    if clear < SHADED or not LEAST_POWER < power < MOST_POWER:
+        return None
+    return DepthShape(power, float(np.median(depths)), cosine, [], [])
+
+
+def _brightness(rgb_u8: Image, tissue: Mask) -> tuple[NDArray, Mask]:
+    """(h, w) smooth log of linear red, and where there is tissue to see it."""
+    size = SMALL_WIDTH, max(round(tissue.shape[0] * SMALL_WIDTH / tissue.shape[1]), 1)
+    share = cv2.resize(tissue.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    log_red = np.log(np.maximum((rgb_u8[..., 0] / np.float32(255)) ** np.float32(2.2), np.float32(1e-3)))
+    total = cv2.resize(log_red * tissue, size, interpolation=cv2.INTER_AREA)
+    total, weight = (cv2.GaussianBlur(image, (0, 0), BLUR_PX) for image in (total, share))
+    return total / np.maximum(weight, 1e-3), share > 0.5
+
+
+def _recedes(bright: NDArray, usable: Mask) -> bool:
+    """Whether one frame gets brighter in nearly all directions from its dark place."""
+    if usable.sum() < SECTORS * FEWEST_PX:
+        return False
+    limit, middle = np.percentile(bright[usable], [DARK_PERCENT, 50])
+    if middle - limit < DARKER:
+        return False
+    dark = (usable & (bright <= limit)).astype(np.uint8)
+    _, _, stats, centers = cv2.connectedComponentsWithStats(dark)
+    x0, y0 = centers[1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])]
+    y, x = np.nonzero(usable)
+    away = np.log(np.hypot(x - x0, y - y0) + BLUR_PX)
+    sector = ((np.arctan2(y - y0, x - x0) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
+    parts = [at for k in range(SECTORS) if len(at := np.flatnonzero(sector == k)) > FEWEST_PX]
+    rises = [_correlation(away[at], bright[y[at], x[at]]) > RISES for at in parts]
+    return bool(rises) and float(np.mean(rises)) >= MOST_RISE
+
+
+def _correlation(x: NDArray, y: NDArray) -> float:
+    """Of two (N,), -1..1; 0 where one is constant, as overexposed tissue is."""
+    return float(np.corrcoef(x, y)[0, 1]) if min(np.ptp(x), np.ptp(y)) > 1e-4 else 0.0
+
 
 PARALLAX_DEGREES = 2.0  # rays to a point differ by this, or its depth is that of the shading
 FEWEST = 200  # observations of such points

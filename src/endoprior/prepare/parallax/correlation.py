@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...compute.fastmath import REORDERED
+from ...compute.simd import REORDERED
 from ..camera_path.even_view import EvenView, Warp
 
 NOISE = 2e-4  # variance of the detail that is noise
