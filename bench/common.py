@@ -38,7 +38,7 @@ Steps = dict[str, Callable[[Any], Any]]
 
 WARM_UP = 2
 """Uncounted laps of ours, and one of torch: compilation, first touch of memory."""
-TURN_MS, MOST_TURNS, LEAST_LAPS = 2000.0, 25, 9
+TURN_MS, MAX_TURNS, MIN_LAPS = 2000.0, 25, 9
 """The two take turns for about that long; ours runs a few more times where torch leaves it too few."""
 COLD_MS = 4000.0
 """A first lap of torch that takes longer counts itself, and is the only one."""
@@ -135,11 +135,11 @@ def race(ours: Steps, theirs: Steps | None = None) -> dict[str, tuple[float, flo
     if theirs is not None:
         first = lap(theirs)
         length += sum(first.values())
-    turns = min(max(int(TURN_MS / length), 1), MOST_TURNS)
+    turns = min(max(int(TURN_MS / length), 1), MAX_TURNS)
     cold = theirs is not None and sum(first.values()) > COLD_MS
     if cold:
         count("theirs", first)
-    laps = max(turns, LEAST_LAPS)
+    laps = max(turns, MIN_LAPS)
     for turn in range(turns):
         # Ours is spread evenly over the turns.
         for _ in range(laps * turn // turns, laps * (turn + 1) // turns):
@@ -193,11 +193,11 @@ def part_rows(whole: str, steps: Steps, parts: dict[str, list[tuple[object, str]
     """Rows of the parts of a whole stage, and of what is left of it, with their shares: means over a few laps."""
     began = time.perf_counter()
     with stopwatch(parts) as taken:
-        for _ in range(LEAST_LAPS):
+        for _ in range(MIN_LAPS):
             lap(steps)
     whole_ms = 1e3 * (time.perf_counter() - began)
     taken["the rest"] = max(whole_ms - sum(taken.values()), 0.0)
-    return [Row(f"{whole}: {part}", *size, ms / LEAST_LAPS, share=ms / whole_ms) for part, ms in taken.items()]
+    return [Row(f"{whole}: {part}", *size, ms / MIN_LAPS, share=ms / whole_ms) for part, ms in taken.items()]
 
 
 def facts() -> dict[str, Any]:

@@ -30,7 +30,7 @@ CLIPS = {"stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97), 
 LENGTH, LENGTH_FRAMES = ((230, 140), (380, 100)), (0, 46, 80)
 """Two points of the first frame of `bowel_lift`, px, and the frames that are shown."""
 
-MOST_MOVED_MM = 60.0
+MAX_MOVED_MM = 60.0
 """End of the color scale of its displacement."""
 IN_BLENDER = (0, 80)
 """Frames of `bowel_lift` that Blender shows."""
@@ -121,7 +121,7 @@ def moving_in_pyvista(work: Path) -> None:
         plotter = pyvista.Plotter(off_screen=True, window_size=(640, 512))
         reader.set_active_time_value(reader.time_values[frame])
         bar = {"title": "displacement, mm", "color": "white", "fmt": "%.0f"}
-        look = {"cmap": "turbo", "clim": (0, MOST_MOVED_MM), "ambient": 0.4, "scalar_bar_args": bar}
+        look = {"cmap": "turbo", "clim": (0, MAX_MOVED_MM), "ambient": 0.4, "scalar_bar_args": bar}
         plotter.add_mesh(reader.read()[0], scalars="displacement", **look)
         plotter.camera.position, plotter.camera.focal_point, plotter.camera.up = (0, 0, 0), (0, 0, 1), (0, -1, 0)
         plotter.camera.view_angle = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy)))

@@ -24,7 +24,7 @@ STRAY_PIXELS = {"random": 1e-4, "trained": 5e-4}
 1.5.3 lets alpha reach 0.999 (see render/gsplat.py)."""
 WINDOW = (112, 80)
 """px, the part of a trained scene's image that interpreted kernels render, in some minutes."""
-LARGEST_OPACITY = 0.985
+MAX_OPACITY = 0.985
 """Of random scenes: below where the two caps on alpha differ."""
 IMAGES = ("color", "alpha", "depth")
 
@@ -92,7 +92,7 @@ def random_case(seed: int) -> Case:
         (np.stack([x, y, z], -1) - pose[:3, 3]) @ pose[:3, :3],
         rng.normal(size=(num, 4)) * 2,
         np.exp(rng.uniform(np.log(0.2), np.log(6.0), (num, 3))) * (z / view.fx)[:, None],
-        rng.uniform(0.01, LARGEST_OPACITY, num),
+        rng.uniform(0.01, MAX_OPACITY, num),
         rng.normal(size=(num, (degree + 1) ** 2, 3)) * 0.3,
         rng.normal(size=(num, 2, 3)) * 0.1,
     )

@@ -20,7 +20,7 @@ from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer, rate_of, temporal_rates
-from endoprior.training.temporal import MOST_POINTS
+from endoprior.training.temporal import MAX_SAMPLED_GAUSSIANS
 from endoprior_baselines.surgicalgaussian import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
 TIME, RATE, EPSILON = 0.4, 1e-3, 1e-15
@@ -38,7 +38,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
             measured += common.rows(name, common.race(steps(num, NUMBA), steps(num, TORCH)), num)
         result = common.race(network(num, relu_network), network(num, relu_network_torch))
         measured += common.rows("network of 8 x 256", result, num)
-    for num in sorted({MOST_POINTS, *common.nums(sizes)}):
+    for num in sorted({MAX_SAMPLED_GAUSSIANS, *common.nums(sizes)}):
         other = temporal(num, TORCH) if num <= TORCH_MOST_PAIRS else None
         measured += common.rows("temporal term", common.race(temporal(num, NUMBA), other), num)
     for picture in common.pictures(sizes):

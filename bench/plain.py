@@ -18,7 +18,7 @@ from endoprior.render.projection import Projected, project
 
 TILE = 16
 """Side of a tile, px."""
-LEAST_POWER = -20.0
+MIN_POWER = -20.0
 """Powers below this change nothing: alpha is under ALPHA_MIN long before."""
 
 
@@ -66,7 +66,7 @@ def composite(
         dy = pixels_y + (tile // tiles_x * TILE) - center_y
         # Processors are slow at numbers below the normal range, so they are kept out: far below what is drawn here,
         # and by logarithms in the product that nothing stops.
-        power = (dx * (a * dx + b * dy) + c * dy * dy).clamp(min=LEAST_POWER)
+        power = (dx * (a * dx + b * dy) + c * dy * dy).clamp(min=MIN_POWER)
         alpha = (opacity * power.exp()).clamp(max=ALPHA_MAX)
         with torch.no_grad():
             visible = alpha >= ALPHA_MIN

@@ -10,7 +10,7 @@ from benchmark_runs import in_this_process
 
 from endoprior.core.checks import InputError
 from endoprior.runs.log import Growth
-from endoprior_studies.matched_count import MOST_PROBES, Search, next_threshold, search_thresholds
+from endoprior_studies.matched_count import MAX_PROBES, Search, next_threshold, search_thresholds
 from endoprior_studies.matrix import run_matrix
 from endoprior_studies.report import write_report
 from endoprior_studies.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec
@@ -43,13 +43,13 @@ def test_the_next_threshold_lies_inside_of_the_narrowest_bracket():
 
 def test_a_curve_with_a_floor_ends_without_success():
     search = tried_until_done(Search(2e-4, target=500), lambda value: 5000 + 1e-3 / value)
-    assert len(search.tried) == MOST_PROBES and not search.matched
+    assert len(search.tried) == MAX_PROBES and not search.matched
     assert search.best[1].last == min(growth.last for _, growth in search.tried)
 
 
 def test_counts_that_rise_with_the_threshold_end_the_search():
     search = tried_until_done(Search(2e-4, target=1000), lambda value: 800 if value < 3e-4 else 1200)
-    assert len(search.tried) <= MOST_PROBES and not search.matched
+    assert len(search.tried) <= MAX_PROBES and not search.matched
 
 
 def spec_of(**methods: MatchSpec | None) -> Spec:

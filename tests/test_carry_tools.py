@@ -8,7 +8,7 @@ from endoprior.data import FrameSequence
 from endoprior.tool_masks import FoundTools, video_segmenter
 from endoprior.tool_masks.mask_store import MaskStore
 from endoprior.tool_masks.video_segmenter import (
-    MOST_REGIONS,
+    MAX_REGIONS,
     Prompt,
     carry,
     choose_prompts,
@@ -56,7 +56,7 @@ def test_sure_regions_lose_their_rim_and_come_largest_first():
     bridge = box(10, 10, 20, 20) | box(40, 10, 20, 20) | box(30, 20, 10, 2)
     assert len(sure_regions(bridge)) == 2, "a thin bridge does not make one object of two"
     many = np.any([box(10 * i, 10, 8, 8) for i in range(8)], axis=0)
-    assert len(sure_regions(many)) == MOST_REGIONS
+    assert len(sure_regions(many)) == MAX_REGIONS
     assert sure_regions(np.zeros_like(mask)) == []
 
 

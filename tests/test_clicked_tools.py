@@ -13,7 +13,7 @@ from endoprior.data.found_tools import FrameRow, read_rows, write_rows
 from endoprior.data.images import read_tool_mask
 from endoprior.tool_masks.clicked_tools import ToolClick, find_clicked, parse_click
 from endoprior.tool_masks.examples import (
-    LARGEST_REGION,
+    MAX_REGION,
     SURE,
     clicked_region,
     examples_of,
@@ -129,7 +129,7 @@ def test_a_click_grows_to_the_region_of_its_look():
 def test_a_click_on_tissue_stays_small():
     tool = np.zeros((80, 120), bool)
     region = clicked_region(features_of(tool), ~tool, (60, 40))
-    assert region[40, 60] and region.sum() <= LARGEST_REGION * tool.size
+    assert region[40, 60] and region.sum() <= MAX_REGION * tool.size
 
 
 def test_log_odds_count_only_up_to_a_limit():

@@ -19,7 +19,7 @@ from endoprior.runs.train import train
 from endoprior.training import divergence
 from endoprior.training.divergence import (
     CHECK_EVERY,
-    LARGEST_GRADIENT,
+    MAX_GRADIENT,
     WINDOW,
     Diverged,
     DivergenceCheck,
@@ -32,24 +32,24 @@ from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.optimizer import Optimizer, rate_of
 from endoprior.training.own_method import OwnMethod
 
-BAD = [float("nan"), float("inf"), -float("inf"), 2 * LARGEST_GRADIENT, -1e30]
+BAD = [float("nan"), float("inf"), -float("inf"), 2 * MAX_GRADIENT, -1e30]
 
 
 @pytest.mark.parametrize("ops", [NUMBA, TORCH], ids=lambda ops: ops.model.name)
 def test_unusable_entries_are_counted(ops):
     for shape in [(0,), (1,), (7,), (100, 3), (5, 16, 3)]:
         values = torch.randn(shape, generator=torch.Generator().manual_seed(0))
-        assert ops.count_unusable(values, LARGEST_GRADIENT) == 0
+        assert ops.count_unusable(values, MAX_GRADIENT) == 0
         flat = values.reshape(-1)
         count = min(len(BAD), len(flat))
         flat[:count] = torch.tensor(BAD[:count])
-        assert ops.count_unusable(values, LARGEST_GRADIENT) == count
+        assert ops.count_unusable(values, MAX_GRADIENT) == count
 
 
 def test_cells_without_a_new_gradient_do_not_count():
     grid = PlaneGrid(planes((2, 2, 2), 2, 3, (1,)))
     grid.grads[:3], grid.marks[:4] = float("nan"), torch.tensor([0, TOUCHED, TOUCHED | FRESH, FRESH])
-    assert NUMBA.count_unusable_in_planes(grid, LARGEST_GRADIENT) == 3
+    assert NUMBA.count_unusable_in_planes(grid, MAX_GRADIENT) == 3
 
 
 def test_unusable_numbers_are_named():

@@ -19,7 +19,7 @@ from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.model.presets import preset, preset_names
 
-MOST_LINES = {"train": 62}  # it lists the presets
+MAX_LINES = {"train": 62}  # it lists the presets
 VALUES = {
     "--events": "blur:1-2",
     int: 1,
@@ -56,7 +56,7 @@ def examples(page: str) -> list[list[str]]:
 @pytest.mark.parametrize("command", descriptions())
 def test_help_is_one_page_with_examples_that_parse(command, printed):
     page = printed(command, "--help")
-    assert page == printed(command, "-h") and len(page.splitlines()) <= MOST_LINES.get(command, 45)
+    assert page == printed(command, "-h") and len(page.splitlines()) <= MAX_LINES.get(command, 45)
     assert page.startswith(f"usage: endoprior {command}") and page.isascii()
     assert len(examples(page)) >= (2 if "options]" in page and "--" in page else 1)
     for words in examples(page):

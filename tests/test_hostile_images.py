@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from endoprior.data.images import save_png
-from endoprior.data.reading import MOST_PIXELS
+from endoprior.data.reading import MAX_PIXELS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
 from corpus_damage import jpeg_bomb, jpeg_of_two_sizes, mov_bomb, png_bomb, tiff_bomb
@@ -117,7 +117,7 @@ def test_opencv_is_told_the_limit():
     code = "import os; from endoprior.cli import main; main([]); print(os.environ['OPENCV_IO_MAX_IMAGE_PIXELS'])"
     environment = {name: value for name, value in os.environ.items() if "OPENCV" not in name}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert int(done.stdout.split()[-1]) == MOST_PIXELS
+    assert int(done.stdout.split()[-1]) == MAX_PIXELS
 
 
 @pytest.mark.parametrize("answer", [(False, EMPTY_PNG), (True, EMPTY_PNG), (False, None)])

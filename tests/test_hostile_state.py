@@ -26,7 +26,7 @@ from endoprior.model import hexplane
 from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
-from endoprior.system.arrays_file import LARGEST_HEADER
+from endoprior.system.arrays_file import MAX_HEADER
 
 
 @contextmanager
@@ -109,7 +109,7 @@ BYTES = {
     "header of 2^63 bytes": lambda header, data: packed(header, data, 2**63),
     "header beyond the end": lambda header, data: packed(header, data, len(header) + len(data) + 1),
     "header of 90 MB": lambda header, data: packed(header + b" " * 90_000_000, b""),
-    "header too long by one": lambda header, data: packed(header.ljust(LARGEST_HEADER + 1), data),
+    "header too long by one": lambda header, data: packed(header.ljust(MAX_HEADER + 1), data),
     "header no JSON": lambda header, data: packed(b"\xff" * 100, data),
     "header nested": lambda header, data: packed(DEEP.encode(), data),
     "header twice": lambda header, data: packed(header + header, data),

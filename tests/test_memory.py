@@ -15,7 +15,7 @@ import pytest
 from endoprior.data import load_sequence
 from endoprior.runs.train import train
 from endoprior.system import memory
-from endoprior.system.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes, freed_memory_kept
+from endoprior.system.memory import MIN_CACHE, BoundedCache, available_bytes, cache_bytes, freed_memory_kept
 
 
 def test_free_memory_is_between_zero_and_total():
@@ -38,7 +38,7 @@ def test_a_limit_of_the_process_counts():
 )
 def test_the_size_of_caches_can_be_set(monkeypatch, value, wanted):
     monkeypatch.setenv("ENDOPRIOR_CACHE_GB", value)
-    assert cache_bytes() == wanted if wanted is not None else cache_bytes() >= LEAST_CACHE
+    assert cache_bytes() == wanted if wanted is not None else cache_bytes() >= MIN_CACHE
 
 
 @pytest.mark.parametrize(("kind", "option"), [(resource.RLIMIT_DATA, "-d"), (resource.RLIMIT_AS, "-v")])

@@ -9,7 +9,7 @@ start_new_kernel = pytest.importorskip("jupyter_client.manager").start_new_kerne
 NotebookClient = pytest.importorskip("nbclient").NotebookClient
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
-LARGEST_BYTES = 300_000
+MAX_BYTES = 300_000
 TRAINING = """
 import endoprior, signal
 from pathlib import Path
@@ -34,7 +34,7 @@ def test_stored_output_is_there_and_small(path):
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert any("image/jpeg" in output.get("data", {}) for output in outputs)
     assert not any(output.output_type == "error" or output.get("name") == "stderr" for output in outputs)
-    assert path.stat().st_size < LARGEST_BYTES
+    assert path.stat().st_size < MAX_BYTES
     assert all(cell.execution_count for cell in notebook.cells if cell.cell_type == "code")
 
 

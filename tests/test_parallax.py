@@ -21,7 +21,7 @@ from endoprior.initialization.sampling import GUESSED, pixel_probability
 from endoprior.model.presets import preset
 from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.camera_path.even_view import EvenView, Warp, matrix_at
-from endoprior.prepare.camera_path.partners import LEAST_DEGREES, MOST_DEGREES, choose_partners, parallax
+from endoprior.prepare.camera_path.partners import MAX_DEGREES, MIN_DEGREES, choose_partners, parallax
 from endoprior.prepare.frames import WORK
 from endoprior.prepare.parallax.correlation import correlation
 from endoprior.prepare.parallax.measure import bent, checked, measure_depth
@@ -58,7 +58,7 @@ def test_partners_lie_on_both_sides_soon_and_with_parallax():
     partners = partners_of(poses)
     for i, found in enumerate(partners):
         degrees = parallax(poses, i, found, CENTERED, SIZE, 80.0)
-        assert ((degrees >= LEAST_DEGREES) & (degrees <= MOST_DEGREES)).all() and len(set(found)) == len(found) <= 4
+        assert ((degrees >= MIN_DEGREES) & (degrees <= MAX_DEGREES)).all() and len(set(found)) == len(found) <= 4
     assert {np.sign(j - 20) for j in partners[20]} == {-1, 1} and len(partners[20]) == 4
     assert max(abs(j - 20) for j in partners[20]) <= 10  # 5 degrees at 80 mm are 7 mm
     assert all(j > 0 for j in partners[0])

@@ -20,7 +20,7 @@ from endoprior.core.config import DataConfig
 from endoprior.data import reading
 from endoprior.data.files import in_order
 from endoprior.data.images import read_header
-from endoprior.data.reading import MOST_NODES, kind_of, load_yaml, read_bytes, read_numpy, read_text
+from endoprior.data.reading import MAX_NODES, kind_of, load_yaml, read_bytes, read_numpy, read_text
 from endoprior.phantom import PhantomConfig
 from endoprior.prepare import PrepareConfig
 from endoprior.prepare.stereo import StereoConfig
@@ -51,7 +51,7 @@ def test_files_too_large_are_rejected_by_their_size_in_mb(tmp_path, monkeypatch)
         file.truncate((1 << 30) + 1)
     with pytest.raises(InputError, match="at most 1024 MB, got 1024 MB"):
         read_bytes(tmp_path / "sparse")
-    monkeypatch.setattr(reading, "MOST_TEXT_BYTES", 1 << 20)
+    monkeypatch.setattr(reading, "MAX_TEXT_BYTES", 1 << 20)
     (tmp_path / "text").write_bytes(bytes(3 << 20))
     with pytest.raises(InputError, match="at most 1 MB, got 3 MB"):
         read_text(tmp_path / "text", "words", HINT)
@@ -103,7 +103,7 @@ def test_sound_arrays_are_read_as_numpy_reads_them(tmp_path, array):
 
 
 def test_an_archive_is_measured_before_it_is_unfolded(tmp_path, monkeypatch):
-    monkeypatch.setattr(reading, "MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(reading, "MAX_BYTES", 1 << 20)
     np.savez_compressed(tmp_path / "a.npz", a=np.zeros(1 << 18))
     with pytest.raises(InputError, match="1 arrays of 2 MB; at most 1 MB"):
         read_numpy(tmp_path / "a.npz", "numbers", HINT)
@@ -130,7 +130,7 @@ def test_yaml_counts_what_aliases_stand_for():
     assert load_yaml("a: &a [1, 2]\nb: *a\nc: {<<: {d: 1}, e: 2}") == {"a": [1, 2], "b": [1, 2], "c": {"d": 1, "e": 2}}
     many = ", ".join(["*a"] * 300)
     texts = {
-        f"a: &a [{', '.join('1' * 400)}]\nb: [{many}]": f"at most {MOST_NODES}",
+        f"a: &a [{', '.join('1' * 400)}]\nb: [{many}]": f"at most {MAX_NODES}",
         "a: &a [*a]": "itself",
         "[" * 60 + "]" * 60: "nested",
         "a: 1\nb: {c: 1, c: 2}": "'c' twice",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endoprior.tool_masks import over_time
-from endoprior.tool_masks.over_time import KEEP, MOST_LOG_ODDS, Look, decide_over_time
+from endoprior.tool_masks.over_time import KEEP, MAX_LOG_ODDS, Look, decide_over_time
 from endoprior.tool_masks.regions import candidate_regions, tool_regions
 
 HEIGHT, WIDTH = 96, 128
@@ -142,4 +142,4 @@ def test_a_long_clip_is_decided_in_chunks_that_know_their_neighbors(monkeypatch)
 def test_sure_frames_do_not_outweigh_all_others():
     looks = [look(odds((bar(), 1000.0 if t == 0 else -3.0))) for t in range(10)]
     found = list(decide_over_time(looks, VIEW))
-    assert MOST_LOG_ODDS < 1000 and not any(tools.tool_mask.any() for tools in found[3:])
+    assert MAX_LOG_ODDS < 1000 and not any(tools.tool_mask.any() for tools in found[3:])

@@ -10,7 +10,7 @@ from endoprior.data import load_sequence
 from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training import preflight as training_memory
-from endoprior.training.preflight import LEAST_BYTES, PICTURE_BYTES, least_bytes
+from endoprior.training.preflight import MIN_BYTES, PICTURE_BYTES, least_bytes
 
 
 def test_by_hand():
@@ -21,8 +21,8 @@ def test_by_hand():
     motion, changes, frame_motion = basis.num_bases * 3, basis.num_change_bases * channels, 17 * 3
     state = 3 * 4 * 300 * (per_gaussian + motion + changes) + 4 * 300 * frame_motion
     state += 2 * 4 * 300 * max(per_gaussian, motion, changes, frame_motion)
-    assert least_bytes(cfg, 300, 15, 48, 40) - LEAST_BYTES - PICTURE_BYTES * 48 * 40 >= state
-    assert least_bytes(cfg, 300, 15, 48, 40) < LEAST_BYTES + PICTURE_BYTES * 48 * 40 + 2 * state
+    assert least_bytes(cfg, 300, 15, 48, 40) - MIN_BYTES - PICTURE_BYTES * 48 * 40 >= state
+    assert least_bytes(cfg, 300, 15, 48, 40) < MIN_BYTES + PICTURE_BYTES * 48 * 40 + 2 * state
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian"])

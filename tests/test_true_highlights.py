@@ -63,7 +63,7 @@ def test_a_scene_that_shows_the_truth_without_highlights_has_that_score(sequence
     by_hand = []
     for frame in sequence.frames("test"):
         true = truth.no_highlights(frame.index)
-        below = frame.tissue_mask & (truth.tissue(frame.index).mean(-1) - true.mean(-1) >= scorer.LEAST)
+        below = frame.tissue_mask & (truth.tissue(frame.index).mean(-1) - true.mean(-1) >= scorer.MIN_HIGHLIGHT_LEVELS)
         seen = (scene.render(frame.time, frame.camera).color.numpy() * 255 + 0.5).astype(np.uint8) / 255
         by_hand.append(-10 * np.log10(np.mean((seen - true / 255)[below] ** 2)))
     assert scores["psnr_highlights_kept"] == pytest.approx(np.mean(by_hand), abs=1e-3)

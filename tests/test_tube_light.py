@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from endoprior.prepare.camera_path import shape
-from endoprior.prepare.camera_path.path_facts import MOST_RATIO
+from endoprior.prepare.camera_path.path_facts import MAX_DEPTH_RATIO
 from endoprior.prepare.camera_path.shape import axial_cosine, shape_by_light
 from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
 from endoprior.prepare.relative_depth import fit_shading
@@ -52,7 +52,7 @@ def test_a_tube_lit_by_a_lamp_at_the_camera_gives_its_depth_back(monkeypatch):
     for frame in frames:
         assert error(found.shaped(0, frame.depth), z, measured) < 0.04
         assert error(frame.depth, z, measured) > 0.15
-    assert found.shaped(1, frames[1].depth).max() <= MOST_RATIO * found.middle
+    assert found.shaped(1, frames[1].depth).max() <= MAX_DEPTH_RATIO * found.middle
 
 
 def test_the_usual_exponent_is_nearer_to_a_tube_than_plain_shading():

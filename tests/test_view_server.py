@@ -433,7 +433,7 @@ def short_config() -> Config:
 @pytest.mark.slow
 def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(live, "REFRESH_SECONDS", 0.0)
-    monkeypatch.setattr(live, "LARGEST_SHARE", math.inf)
+    monkeypatch.setattr(live, "MAX_TIME_SHARE", math.inf)
     digests, shown = [], []
     for watched in (False, True):
         out, client = tmp_path / f"run{watched}", None

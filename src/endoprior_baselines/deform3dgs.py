@@ -45,11 +45,11 @@ MOVING_PERCENTILE = 95.0
 """A pixel moves if its gray level departs from its mean over time by more than this percentile of all departures."""
 MANY_FRAMES = 150
 """With more frames, every second one adds points."""
-FEWEST_NEW = 50
+MIN_NEW = 50
 """A frame that shows no more new pixels adds none."""
 SHARE = 0.1
 """Of the new pixels of a frame that are added, and of all points that are kept at the end."""
-MOST, DRAWN = 600_000, 500_000
+MAX_POINTS, DRAWN = 600_000, 500_000
 """Of more points than the first number, so many are drawn."""
 
 
@@ -152,12 +152,12 @@ def first_points(frames: Sequence[Frame], seed: int) -> PointCloud:
         inside, cells = _cells(cloud.points, first)
         new = inside.copy()
         new[inside] = ~covered.reshape(-1)[cells[inside]] | moving.reshape(-1)[cells[inside]]
-        if np.count_nonzero(new) > FEWEST_NEW:
+        if np.count_nonzero(new) > MIN_NEW:
             rows = np.flatnonzero(new)
             clouds.append(cloud.subset(rng.choice(rows, int(SHARE * len(rows)))))
             covered.reshape(-1)[cells[new]] = True
     cloud = concatenated(clouds)
-    if len(cloud) > MOST:
+    if len(cloud) > MAX_POINTS:
         cloud = cloud.subset(rng.integers(len(cloud), size=DRAWN))
     cloud = cloud.subset(np.sort(rng.choice(len(cloud), int(SHARE * len(cloud)), replace=False)))
     return enough(cloud, ", a tenth of the tissue pixels with depth")

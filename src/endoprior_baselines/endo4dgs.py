@@ -42,7 +42,7 @@ GROW_BELOW, REMOVE_ABOVE = 360_000, 200_000
 DEPTH_EPSILON = 1e-6
 VARIANCE_EPSILON = 1e-12
 """Keeps the gradient of a correlation finite where a depth is flat."""
-LEAST_CONFIDENCE = 1e-6
+MIN_CONFIDENCE = 1e-6
 """Confidence is at least this: its logarithm counts."""
 
 
@@ -92,7 +92,7 @@ class Endo4DGS(Released):
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         frame, out = drawn.frame, drawn.out
         mask, color = frame.tissue_mask[..., None], out.color * frame.tissue_mask[..., None]
-        z = out.depth / out.alpha.clamp(min=LEAST_CONFIDENCE)
+        z = out.depth / out.alpha.clamp(min=MIN_CONFIDENCE)
         known, valid = frame.depth, frame.measured & (z > 0)
         depth, target = without_scale(z, valid), without_scale(known, valid)
         facing = (normal_picture(drawn.splats, drawn.render) * normals_of_depth(known)).sum(-1)
@@ -171,7 +171,7 @@ def confident_error(value: Tensor, target: Tensor, confidence: Tensor) -> Tensor
     """MSE / mean(2 c^2) + mean log c, () of values (P, C) with confidence c (P,); 0 without pixels."""
     if not len(value):
         return value.sum()
-    c = confidence.clamp(min=LEAST_CONFIDENCE)
+    c = confidence.clamp(min=MIN_CONFIDENCE)
     return (value - target).square().mean() / (2 * c.square()).mean() + c.log().mean()
 
 

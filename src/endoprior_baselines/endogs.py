@@ -55,7 +55,7 @@ DEPTH_WEIGHT, HUBER_DELTA, DEPTH_EPSILON = 0.5, 0.2, 1e-5
 TV_WEIGHT = 0.01
 PLANE_WEIGHTS = PlaneWeights(space=1e-3, time=1e-3, ones=2e-2)
 PRUNE_EVERY, RESET_EVERY, FIRST_RESET = 7000, 6000, 500
-MOST_SCALE_SHARE = 0.1
+MAX_SCALE_SHARE = 0.1
 """After the opacity reset at 6,000 larger Gaussians go; share of the extent.
 
 As in `surgicalgaussian`, the radius of 20 px that the release also names is left out.
@@ -175,7 +175,7 @@ class EndoGS(Released):
         grow = gradient >= cfg.density.grow_threshold
         small = largest <= CLONE_EXTENT * EXTENT_MM
         faint = gaussians.opacities < cfg.density.prune_opacity
-        large = (largest > MOST_SCALE_SHARE * EXTENT_MM) & (iteration > RESET_EVERY)
+        large = (largest > MAX_SCALE_SHARE * EXTENT_MM) & (iteration > RESET_EVERY)
         remove = (faint | large) & (iteration % PRUNE_EVERY == 0)
         if len(grow) + int(grow.sum()) > MAX_GAUSSIANS:
             grow = torch.zeros_like(grow)

@@ -45,7 +45,7 @@ COEFFICIENTS = ("basis_weights", "basis_centers", "basis_widths")
 """Names of the tensors w, c, s of the Gaussians, (N, B, C) each."""
 
 f4 = np.float32
-_SMALLEST_SQUARE = f4(1e-4)  # added to the squared width
+_MIN_SQUARE = f4(1e-4)  # added to the squared width
 _REACH = f4(9.3)  # exp(-9.3^2) is below the smallest normal float32: 2^-126
 _LOG2_E = f4(log2(np.e))
 # Processors are slow with numbers below 1e-38, and the flank of a basis function leads there. As shares of epsilon:
@@ -97,7 +97,7 @@ def value_at(
     """
     if sink is not None and weights.device.type == "cpu":
         return _Compiled.apply(weights, centers, widths, time, sink)
-    ratio = (time - centers) ** 2 / (widths**2 + float(_SMALLEST_SQUARE))
+    ratio = (time - centers) ** 2 / (widths**2 + float(_MIN_SQUARE))
     return (weights * torch.exp(-(ratio**2))).sum(1)
 
 
@@ -137,7 +137,7 @@ def _value(weights, centers, widths, time, place, lanes, held, slot):
     # Writes w exp(-ratio^2) of the coefficients from `place` on to `held` from `slot` on.
     away = broadcast(time) - load_some(centers, place, lanes)
     width = load_some(widths, place, lanes)
-    square = fma(width, width, broadcast(_SMALLEST_SQUARE))
+    square = fma(width, width, broadcast(_MIN_SQUARE))
     if _reach(away, square):
         store(held, slot, load_some(weights, place, lanes) * _bell(away * away / square))
     else:
@@ -194,7 +194,7 @@ def _step(
 ):  # fmt: skip
     # One step of the `LANES` coefficients from `place` on; `held` (K, ...) has the gradient of the value of each.
     weight, center, width = load_some(w, place, lanes), load_some(c, place, lanes), load_some(s, place, lanes)
-    square = fma(width, width, broadcast(_SMALLEST_SQUARE))
+    square = fma(width, width, broadcast(_MIN_SQUARE))
     v_weight = v_center = v_width = broadcast(_ZERO)
     for k in range(len(times)):
         away = broadcast(times[k]) - center

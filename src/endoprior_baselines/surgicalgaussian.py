@@ -128,13 +128,13 @@ COLOR_SHARE, TV_WEIGHT, DEPTH_WEIGHT = 0.8, 0.02, 0.001
 DISTANCE_WEIGHT, SHAPE_WEIGHT, NUM_NEIGHBORS = 0.2, 40.0, 4
 """Weights of the sequence `cutting`; those of `pulling` are 0. The release asks for five neighbors and drops itself."""
 RESET_EVERY, FIRST_RESET = 3000, 500
-MOST_SCALE = 0.1
+MAX_SCALE = 0.1
 """After the reset of opacities at 3,000 larger Gaussians go; units of length.
 
 The release also names a radius of 20 px. In the code that it descends from radii are 0 whenever they are compared:
 growth, just before, clears them (docs/log.md). So it is left out.
 """
-SMALLEST_SCALE_MM = 1e-6
+MIN_SCALE_MM = 1e-6
 NETWORK_LATER = 4 / 3
 """The network's rate decays over this many times the iterations of the centers'."""
 
@@ -180,7 +180,7 @@ class NetworkMotion(Motion):
         rows = slice(None) if chosen is None else chosen
         means, quats, log_scales = (gaussians[name][rows] for name in ("means", "quats", "log_scales"))
         found = field(means.detach() / UNIT_MM, time)
-        scales = (log_scales.exp() + UNIT_MM * found["scales"]).abs().clamp(min=SMALLEST_SCALE_MM)
+        scales = (log_scales.exp() + UNIT_MM * found["scales"]).abs().clamp(min=MIN_SCALE_MM)
         return Offsets(
             means=UNIT_MM * found["means"],
             log_scales=scales.log() - log_scales,
@@ -243,7 +243,7 @@ class SurgicalGaussian(Released):
         planned = density.plan(stats, gaussians.scales, gaussians.opacities, UNIT_MM, cfg.density)
         if iteration <= RESET_EVERY:
             return planned
-        large = gaussians.scales.amax(-1) > MOST_SCALE * UNIT_MM
+        large = gaussians.scales.amax(-1) > MAX_SCALE * UNIT_MM
         large &= ~planned.split
         rules = {**planned.removed_by, "size": large}
         return Plan(clone=planned.clone & ~large, split=planned.split, remove=planned.remove | large, removed_by=rules)

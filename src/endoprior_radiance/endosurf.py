@@ -54,7 +54,7 @@ STEPS, SECANT_STEPS = 128, 8
 """In which the first crossing of the surface is looked for, and then refined."""
 SHARE = 0.005
 """Share of the measured pixels of a frame that are taken, ..."""
-FEWEST = 100
+MIN_PIXELS = 100
 """... but at least about so many: a sphere around a few points of a small frame would miss most of the tissue."""
 LOW, HIGH = 3.0, 99.9
 """Percentiles of all measured depths between which a point counts: edges of tools are often measured too near."""
@@ -304,7 +304,7 @@ def _points(frames: RayFrames, position: int, ends: tuple[float, float]) -> NDAr
     """Evenly chosen measured points of a frame; a fixed choice, since nothing depends on which."""
     depth, camera = frames.depth(position), frames.frame(position).camera
     pixels = np.flatnonzero((depth > 0) & (depth >= ends[0]) & (depth <= ends[1]))
-    chosen = pixels[:: max(1, min(int(1 / SHARE), len(pixels) // FEWEST))]
+    chosen = pixels[:: max(1, min(int(1 / SHARE), len(pixels) // MIN_PIXELS))]
     at = pixel_centers(camera.width, camera.height).reshape(-1, 2)[chosen].astype(np.float64)
     return without_outliers(back_project(at, depth.ravel()[chosen].astype(np.float64), camera))
 

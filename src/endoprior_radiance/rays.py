@@ -20,7 +20,7 @@ from endoprior.core.checks import input_error
 from endoprior.core.geometry import FARTHEST_MM
 from endoprior.core.types import Frame
 
-MOST_DEPTHS = 2**22
+MAX_DEPTHS = 2**22
 """Depths over which percentiles are taken, about: evenly spaced pixels of all frames."""
 NEAREST = 1e-6
 """Points nearer to the plane of the camera than this, in units of `scale`, are moved away from it."""
@@ -149,7 +149,7 @@ class RayFrames:
 
     def depth_percentiles(self, low: float, high: float, *, missing: bool) -> tuple[float, float]:
         """Percentiles of the depths of all training frames, mm; 0 without any. `missing` depth counts as 0, or not."""
-        every = max(1, len(self) * self.camera.width * self.camera.height // MOST_DEPTHS)
+        every = max(1, len(self) * self.camera.width * self.camera.height // MAX_DEPTHS)
         depths = np.concatenate([self.depth(k).ravel()[::every] for k in range(len(self))])
         depths = depths if missing else depths[depths > 0]
         first, last = np.percentile(depths, (low, high)) if depths.size else (0.0, 0.0)

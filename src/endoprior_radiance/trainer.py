@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from endoprior import Config, FrameSequence
 from endoprior.system.arrays_file import ArraySpec, part
-from endoprior.training.divergence import LARGEST_GRADIENT, Diverged, Watch, unusable_numbers
+from endoprior.training.divergence import MAX_GRADIENT, Diverged, Watch, unusable_numbers
 from endoprior.training.trainer import (
     DEFAULT_FRAMES_PER_SECOND,
     Stage,
@@ -226,7 +226,7 @@ def _unusable(field: RadianceField) -> dict[str, int]:
     counts: dict[str, int] = {}
     for name, parameter in field.named_parameters():
         if parameter.grad is not None:
-            wrong = int((~(parameter.grad.abs() <= LARGEST_GRADIENT)).sum())  # NaN fails too
+            wrong = int((~(parameter.grad.abs() <= MAX_GRADIENT)).sum())  # NaN fails too
             network = name.partition(".")[0]
             counts[network] = counts.get(network, 0) + wrong
     return counts

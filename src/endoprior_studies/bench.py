@@ -17,9 +17,9 @@ from .tool_training import bench as bench_masks
 if TYPE_CHECKING:
     from .spec import Spec
 
-MOST_CORES = 4096
+MAX_CORES = 4096
 """Largest --cores and --threads."""
-MOST_ITERATIONS = 10_000_000
+MAX_ITERATIONS = 10_000_000
 
 
 @dataclass
@@ -131,8 +131,8 @@ def _page(argv: list[str]) -> str:
 
 def _checked(args: Bench) -> dict[str, Path]:
     """The folders of `--data` by the name of their sequence; InputError if an option has an impossible value."""
-    limits = (("--threads", args.threads, 1, MOST_CORES), ("--cores", args.cores, 0, MOST_CORES))
-    for option, value, least, most in (*limits, ("--iterations", args.iterations, 0, MOST_ITERATIONS)):
+    limits = (("--threads", args.threads, 1, MAX_CORES), ("--cores", args.cores, 0, MAX_CORES))
+    for option, value, least, most in (*limits, ("--iterations", args.iterations, 0, MAX_ITERATIONS)):
         if not least <= value <= most:
             raise input_error(option, f"{least} to {most}", f"{value}", "choose a value in this range.")
     if args.weights_dir and not args.weights_dir.is_dir():

@@ -16,11 +16,11 @@ from .spec import Cell, MatchSpec, Spec
 
 WITHIN = 0.03
 """Share of the wanted count by which the found one may differ."""
-MOST_PROBES = 8
+MAX_PROBES = 8
 FIRST_SLOPE = 0.7
 """Power with which the count is taken to fall before two trainings say it."""
-SMALLEST_SLOPE = 0.1
-LARGEST_STEP = 8.0
+MIN_SLOPE = 0.1
+MAX_STEP = 8.0
 """Factor between two thresholds while all tried ones lie on one side."""
 INSIDE = 0.1
 """Share of the bracket, in logarithms, that the next threshold keeps away from its ends."""
@@ -56,7 +56,7 @@ def next_threshold(search: Search) -> float | None:
     """The threshold to train with next; None if the search is over, with or without success."""
     if not search.tried:
         return search.start
-    if search.matched or len(search.tried) >= MOST_PROBES:
+    if search.matched or len(search.tried) >= MAX_PROBES:
         return None
     points = [(math.log(value), math.log(growth.last / search.target)) for value, growth in search.tried]
     above, below = [p for p in points if p[1] > 0], [p for p in points if p[1] <= 0]
@@ -70,8 +70,8 @@ def next_threshold(search: Search) -> float | None:
     slope = FIRST_SLOPE
     if len(points) > 1:
         (one, first), (other, second) = points[-2:]
-        slope = max((first - second) / (other - one), SMALLEST_SLOPE)
-    step = min(max(excess / slope, -math.log(LARGEST_STEP)), math.log(LARGEST_STEP))
+        slope = max((first - second) / (other - one), MIN_SLOPE)
+    step = min(max(excess / slope, -math.log(MAX_STEP)), math.log(MAX_STEP))
     return math.exp(value + step)
 
 

@@ -26,13 +26,13 @@ from .spec import MatchSpec, MethodSpec, SequenceSpec, Spec, SpecSelection, cell
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
-MOST_EXTENDED = 8
+MAX_EXTENDED = 8
 FOLDER = Path(__file__).parent / "specs"
 """Specs that come with the program. `endoprior bench` takes them by name: `quick`, `sized`, `sized/growth`."""
 MISSING = "install the package with this plugin; `endoprior plugins` lists what is installed."
 """What to do about a name that no installed package has."""
 READERS: dict[str, Callable[[str], Any]] = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
-MOST_CELLS = 100_000
+MAX_CELLS = 100_000
 
 
 def spec_names() -> list[str]:
@@ -138,8 +138,8 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
     text = read_text(path, "a readable file", "Correct the path.")
     if path.resolve() in chain:
         raise InputError(f"{path}: expected a file that does not extend itself. Fix: Remove one `extends`.")
-    if len(chain) >= MOST_EXTENDED:
-        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Fix: Merge some.")
+    if len(chain) >= MAX_EXTENDED:
+        raise InputError(f"{path}: expected at most {MAX_EXTENDED} files that extend each other. Fix: Merge some.")
     try:
         values = READERS[path.suffix](text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # such as a number of 5000 digits
@@ -221,7 +221,7 @@ def _check_cells(spec: Spec) -> None:
     folds = sum(len(sequence.folds) for sequence in spec.sequences.values())
     count = len(spec.seeds) * folds * max(len(spec.budgets), 1) * len(spec.methods)
     where = "methods x sequences x budgets x seeds"
-    _demand(count <= MOST_CELLS, where, f"at most {MOST_CELLS}", f"{count}", "split.")
+    _demand(count <= MAX_CELLS, where, f"at most {MAX_CELLS}", f"{count}", "split.")
     for cell in cells(spec):
         options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed, fold=cell.fold)
         if not spec.has_config(cell.method):

@@ -29,7 +29,7 @@ from .findings import SEEN_AS_TISSUE, Finding
 from .report import table, unit_reason
 
 SHOWN = 4  # Number of frames shown
-MOST_UNSURE = 6  # Largest number of frames shown whose masks are uncertain
+MAX_UNSURE = 6  # Largest number of frames shown whose masks are uncertain
 UNSURE_HEIGHT = 2.2  # Of their row in the figure, inches
 RULER_MM = 10.0  # Length of the ruler, at the median depth of the frame
 TOOL_COLOR, BORDER_COLOR, FLAG_COLOR = "#ff3b30", "#ffd60a", "#d62728"
@@ -48,7 +48,7 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     # Use a canvas directly: selecting a Matplotlib backend would change the whole process.
     confidence = facts.masks.confidence
     like = facts.masks.tissue_like
-    unsure = sorted(facts.masks.uncertain, key=lambda i: (confidence[i], i))[: MOST_UNSURE - (like is not None)]
+    unsure = sorted(facts.masks.uncertain, key=lambda i: (confidence[i], i))[: MAX_UNSURE - (like is not None)]
     figure = Figure(figsize=(15, 14 + UNSURE_HEIGHT * bool(unsure or like)), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     camera = facts.camera
@@ -98,7 +98,7 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
 
 def _draw_doubtful(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
     """Frames with their masks outlined: one with what moves like tissue, if anything does, then the least certain."""
-    axes, like = part.subplots(1, MOST_UNSURE, squeeze=False)[0], facts.masks.tissue_like
+    axes, like = part.subplots(1, MAX_UNSURE, squeeze=False)[0], facts.masks.tissue_like
     for axis in axes:
         axis.set_axis_off()
     for place, (axis, frame) in enumerate(zip(axes, frames, strict=False)):  # fewer frames leave places empty

@@ -13,7 +13,7 @@ from ..core.shell import command
 from ..data.description import PrepareRecord
 
 Severity = Literal["error", "warning", "note"]
-FEWEST_FRAMES = 2  # Training needs as many
+MIN_TRAINING_FRAMES = 2  # Training needs as many
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def set_values(about: About, **values: Any) -> str:
 
 def skip(about: About, frames: tuple[int, ...]) -> str:
     """Train without some frames; a look at the files if too few are left."""
-    if about.frames - len(set(frames)) < FEWEST_FRAMES:
+    if about.frames - len(set(frames)) < MIN_TRAINING_FRAMES:
         return f"look at the images in {about.path}: they may not be one video of one scene"
     before = read_ranges("skip_frames", about.data.skip_frames)
     # Positions of the frames of this check among those that it would have without `skip_frames`.

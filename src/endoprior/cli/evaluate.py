@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..model.scene import RenderedScene
 
 BETTER = "\u2191 higher is better, \u2193 lower is better"
-MOST_MM_PER_UNIT = 1e6
+MAX_MM_PER_UNIT = 1e6
 """Largest --depth-scale."""
 COLUMNS = 3
 """Protocols beside ours in one block, so that lines stay near 100 characters."""
@@ -105,8 +105,8 @@ class Eval(Command):
         from ..evaluation.scoring import evaluate
 
         self._reject(["data"], "--pictures FOLDER DATA", "--data as well")
-        if self.depth_scale is not None and not 0 < self.depth_scale <= MOST_MM_PER_UNIT:
-            want = f"a number above 0, up to {MOST_MM_PER_UNIT:g}"
+        if self.depth_scale is not None and not 0 < self.depth_scale <= MAX_MM_PER_UNIT:
+            want = f"a number above 0, up to {MAX_MM_PER_UNIT:g}"
             raise input_error("--depth-scale", want, f"{self.depth_scale}", "Correct it.")
         out = self.out or folder
         require_writable_folder("--out" if self.out else "--pictures", out)

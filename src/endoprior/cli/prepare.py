@@ -21,7 +21,7 @@ from .progress import Counting
 if TYPE_CHECKING:
     from ..prepare.folder_path import FolderPath
 
-MOST_NAMED = 5  # times that a note names; more are counted
+MAX_NAMED = 5  # times that a note names; more are counted
 TRUTH = Path("truth", "camera_to_world.npy")
 
 
@@ -72,7 +72,7 @@ class Prepare(Command):
         bad = [f"{each.start:.1f}-{each.end:.1f} s {each.reason}" for each in choice.stretches if each.reason]
         if not choice.number:
             return []
-        named = ", ".join(bad[:MOST_NAMED]) + (f" and {len(bad) - MOST_NAMED} more" if bad[MOST_NAMED:] else "")
+        named = ", ".join(bad[:MAX_NAMED]) + (f" and {len(bad) - MAX_NAMED} more" if bad[MAX_NAMED:] else "")
         start, end = (f"{time:.2f}" for time in choice.span)
         best = command("prepare", self.video, "OUT", "--start", start, "--end", end)
         what = f"in no segment: {named}" if bad else f"{len(choice.segments)} scenes"

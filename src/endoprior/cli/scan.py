@@ -16,7 +16,7 @@ from .progress import Counting
 if TYPE_CHECKING:
     from ..prepare.segments import Stretch
 
-MOST_LISTED = 12
+MAX_LISTED = 12
 
 
 @dataclass
@@ -68,7 +68,7 @@ class Scan(Command):
 
 
 def stretch_lines(stretches: list[Stretch], best: int) -> list[str]:
-    """The stretches of a video in words, the longest `MOST_LISTED` of them, in order."""
+    """The stretches of a video in words, the longest `MAX_LISTED` of them, in order."""
     number, shown = 0, []
     for each in stretches:
         number += not each.reason
@@ -76,7 +76,7 @@ def stretch_lines(stretches: list[Stretch], best: int) -> list[str]:
         is_best = number - 1 == best
         what = each.reason or f"segment {number}, score {each.score:.1f}" + (" (best)" if is_best else "")
         shown.append((each.seconds, f"  {span:>16}  {what}"))
-    longest = sorted(shown, key=lambda line: -line[0])[:MOST_LISTED]
+    longest = sorted(shown, key=lambda line: -line[0])[:MAX_LISTED]
     lines = [line for entry in shown if entry in longest for line in [entry[1]]]
     rest = len(shown) - len(lines)
     return [*lines, *([f"  and {rest} shorter parts"] if rest > 0 else [])]

@@ -13,7 +13,7 @@ FRAMES_PER_SPAN = 2.0
 CHANGE_SPANS = 0.37
 """Spans of the splines of rotation, scale and color, which change more slowly, for each span of displacement."""
 DEGREE = 3  # of the splines: one with K spans between knots has K + DEGREE functions
-FEWEST_BASES, MOST_BASES = DEGREE + 1, 1000
+MIN_BASES, MAX_BASES = DEGREE + 1, 1000
 CELLS_PER_FRAME = 0.4
 """Cells of a HexPlane along time for each frame, where `fit_to_clip` is on: published are 0.79 and 0.32. With 0.5 every
 second frame can lie on a node of the planes, which only its neighbors pin where it is held out (docs/log.md)."""
@@ -49,7 +49,7 @@ class HexPlaneConfig(Checked):
 class BasisConfig(Checked):
     """Coefficients of each Gaussian for cubic B-splines over time: a linear map, no network."""
 
-    num_bases: Annotated[int, Range(0, MOST_BASES)] = 0
+    num_bases: Annotated[int, Range(0, MAX_BASES)] = 0
     """Spline functions of the displacement; rotation, scale and color have about 0.4 as many. More follow faster
     motion, and frames that were not trained on less well; 0 takes one for every 2 frames, and 3."""
     num_frames: Count = 0
@@ -57,7 +57,7 @@ class BasisConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("num_bases", self.num_bases or FEWEST_BASES, FEWEST_BASES, MOST_BASES)
+        check_range("num_bases", self.num_bases or MIN_BASES, MIN_BASES, MAX_BASES)
 
     @property
     def num_change_bases(self) -> int:
@@ -66,7 +66,7 @@ class BasisConfig(Checked):
 
     def fitted(self, num_frames: int) -> BasisConfig:
         """This config with the numbers for `num_frames`, where none is chosen yet."""
-        chosen = min(max(round(num_frames / FRAMES_PER_SPAN), 1) + DEGREE, MOST_BASES)
+        chosen = min(max(round(num_frames / FRAMES_PER_SPAN), 1) + DEGREE, MAX_BASES)
         return BasisConfig(self.num_bases or chosen, self.num_frames or num_frames)
 
 

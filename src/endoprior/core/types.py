@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-LEAST_ALPHA = 1e-10  # expected depth is divided by at least this
+MIN_ALPHA = 1e-10  # expected depth is divided by at least this
 SURE_DEPTH = 0.4  # confidence of a depth that counts as measured, see `Frame.depth_confidence`
 
 
@@ -119,7 +119,7 @@ class RenderedView:
     @property
     def expected_depth(self) -> Tensor:
         """(H, W) mean z of what is seen, mm: `depth` divided by alpha; 0 where alpha is 0."""
-        return self.depth / self.alpha.clamp(min=LEAST_ALPHA)
+        return self.depth / self.alpha.clamp(min=MIN_ALPHA)
 
     @property
     def color(self) -> Tensor:

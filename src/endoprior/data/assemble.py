@@ -19,7 +19,7 @@ from .truth import RightEye
 
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
 """(H, W, 3) color 0..255, (H, W) True on usable tissue, (H, W) depth in mm with 0 where it is missing."""
-LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6  # of focal lengths; the upper one also of principal points
+MIN_FOCAL_PX, MAX_LENS_PX = 1e-2, 1e6  # of focal lengths; the upper one also of principal points
 
 
 def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1, having: Sequence[Container[int]] = ()) -> list[int]:
@@ -77,8 +77,8 @@ def assemble(
         raise input_error(path, "at least 2 frames of 1x1 px", f"{count} of {width}x{height} / {cfg.shrink}", hint)
     for index, camera in enumerate(cameras):  # finite numbers may still overflow in the renderer
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-        if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):
-            want = f"fx, fy, cx, cy up to {MOST_PX:g} px, fx and fy at least {LEAST_FOCAL_PX:g}"
+        if not (all(abs(value) <= MAX_LENS_PX for value in lens) and min(camera.fx, camera.fy) >= MIN_FOCAL_PX):
+            want = f"fx, fy, cx, cy up to {MAX_LENS_PX:g} px, fx and fy at least {MIN_FOCAL_PX:g}"
             got = ", ".join(f"{value:g}" for value in lens)
             raise input_error(path, want, f"{got} in frame {index}", "correct the intrinsics.")
         far = np.abs(camera.world_to_camera[:3, 3]).max()

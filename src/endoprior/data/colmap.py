@@ -24,7 +24,7 @@ from .reading import read_bytes, read_text
 from .sequence import FrameSequence
 
 FIX = "export the model again."
-MOST_IMAGES = 1_000_000
+MAX_IMAGES = 1_000_000
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")  # where programs put the model
 ImageRow = tuple[str, int, NDArray[np.float64]]
 """Name, camera and pose (qw qx qy qz tx ty tz) of an image."""
@@ -131,7 +131,7 @@ def _are_numbers(words: list[str]) -> bool:
 
 def _cameras_of_bytes(data: bytes) -> dict[int, StoredCamera]:
     cameras, (count,), at = {}, struct.unpack_from("<Q", data), 8
-    for _ in range(min(count, MOST_IMAGES)):
+    for _ in range(min(count, MAX_IMAGES)):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         name = list(MODELS)[model] if 0 <= model < len(MODELS) else f"number {model}"
         size = len(MODELS.get(name, "").split())
@@ -142,7 +142,7 @@ def _cameras_of_bytes(data: bytes) -> dict[int, StoredCamera]:
 
 def _images_of_bytes(data: bytes) -> list[ImageRow]:
     rows, (count,), at = [], struct.unpack_from("<Q", data), 8
-    for _ in range(min(count, MOST_IMAGES)):
+    for _ in range(min(count, MAX_IMAGES)):
         _, *pose, camera = struct.unpack_from("<i7di", data, at)
         end = data.find(b"\0", at + 64)
         if end < 0:

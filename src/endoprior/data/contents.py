@@ -87,15 +87,15 @@ def demand_trainable(
         hint = "the mask's polarity may be inverted, or the depth may be of the tool only."
         raise input_error(depth, "depth on tissue in a training frame", "none", hint)
     share = sum(frames[index].num_colored for index in train) / sum(frames[index].num_measured for index in train)
-    if share < LEAST_COLORED:
-        want = f"a level below {SATURATED} of 255 on at least {LEAST_COLORED:.0%} of the tissue in the training frames"
+    if share < MIN_COLORED:
+        want = f"a level below {SATURATED} of 255 on at least {MIN_COLORED:.0%} of the tissue in the training frames"
         hint = "export the images again, with all values from 0 to 255 in use, or choose a darker part of the video."
         raise input_error(path, want, f"{share:.1%}: the images are white", hint)
 
 
 SATURATED = 250  # a pixel is saturated if its smallest channel reaches this level: its color is at least as bright
 SATURATED_SHARE = 0.02  # least share of tissue that is, else it is the usual highlights, which are to be modelled
-LEAST_COLORED = 0.01  # with a smaller share of the tissue that is not saturated, there is nothing to train on
+MIN_COLORED = 0.01  # with a smaller share of the tissue that is not saturated, there is nothing to train on
 GLARE_PX = 2  # so far around saturated pixels their light spreads
 GLARE_WEIGHT = 0.5
 """How far such pixels are believed beside others. Other frames may show the true color; but what no frame shows better

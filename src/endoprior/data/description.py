@@ -20,7 +20,7 @@ from ..core.shell import Options, command
 from ..system.atomic import write_json
 from .files import read_json
 
-LEAST, MOST = 1e-6, 1e6  # range of every number in the file
+MIN_NUMBER, MAX_NUMBER = 1e-6, 1e6  # range of every number in the file
 TOOLS_FOUND = "tools found"
 """Part of the source of masks that a program found: "tools found in 70% of the samples", "no tools found"."""
 OWN_POSES, COLMAP_POSES = "our own tracks", "COLMAP"
@@ -34,7 +34,7 @@ CORRECT = "correct it or remove it."
 
 def is_number(value: Any) -> bool:
     """Whether a value of a JSON file is a number that can be used."""
-    return not isinstance(value, bool) and isinstance(value, int | float) and LEAST <= value <= MOST
+    return not isinstance(value, bool) and isinstance(value, int | float) and MIN_NUMBER <= value <= MAX_NUMBER
 
 
 def _is_share(value: Any, most: float) -> bool:
@@ -48,11 +48,11 @@ def _is_all(value: Any, kind: type, of: type) -> bool:
 
 NUMBERS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
 KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
-    **dict.fromkeys(NUMBERS, (f"to be a number in [{LEAST:g}, {MOST:g}]", is_number, CORRECT)),
+    **dict.fromkeys(NUMBERS, (f"to be a number in [{MIN_NUMBER:g}, {MAX_NUMBER:g}]", is_number, CORRECT)),
     "depth_unit": ("mm", lambda unit: unit == "mm", "give mm, and mm per stored unit as depth_scale."),
     "mask_tool_value": ("255 or 0", lambda value: value in (0, 255), "give the one that marks tools."),
     "depth_relative": ("true or false", lambda value: isinstance(value, bool), CORRECT),
-    "scale_factor": (f"to be a number in [{LEAST:g}, {MOST:g}]", is_number, CORRECT),
+    "scale_factor": (f"to be a number in [{MIN_NUMBER:g}, {MAX_NUMBER:g}]", is_number, CORRECT),
     "scale_error": ("to be a number in [0, 10]", lambda value: _is_share(value, 10), CORRECT),
     "scale_source": ("to be a text", lambda value: isinstance(value, str) and 0 < len(value) <= 300, CORRECT),
     "sources": ("to map names to texts", lambda value: _is_all(value, dict, str), CORRECT),

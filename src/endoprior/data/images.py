@@ -24,7 +24,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from ..core.checks import input_error
 from ..core.shell import install_command
 from .pixels import is_measured
-from .reading import MOST_PIXELS, demand_file, read_bytes, read_only_array
+from .reading import MAX_PIXELS, demand_file, read_bytes, read_only_array
 
 READERS = {b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"RIFF": WebPImageFile}
 """Pillow's readers, by the first bytes of a file. `PIL.Image.open` has a limit of its own, for the whole process."""
@@ -101,9 +101,9 @@ def decode_image(path: Path, size: Size | None, flags: int = cv2.IMREAD_UNCHANGE
     encoded = read_bytes(path)
     data = encoded.tobytes()
     header = read_header(data)
-    if header and header.width * header.height > MOST_PIXELS:
+    if header and header.width * header.height > MAX_PIXELS:
         got = f"{header.width}x{header.height} px in its header"
-        raise input_error(path, f"an image of at most {MOST_PIXELS // 1_000_000} Mpx", got, "scale it down.")
+        raise input_error(path, f"an image of at most {MAX_PIXELS // 1_000_000} Mpx", got, "scale it down.")
     _silence_opencv()  # the error below replaces its messages
     try:
         pixels = cv2.imdecode(encoded, flags | cv2.IMREAD_IGNORE_ORIENTATION) if header else None
@@ -237,7 +237,7 @@ def _read_exr(path: Path) -> NDArray:
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             (left, top), (right, bottom) = (np.asarray(corner, int).tolist() for corner in file.header()["dataWindow"])
-        if (right - left + 1) * (bottom - top + 1) > MOST_PIXELS:
+        if (right - left + 1) * (bottom - top + 1) > MAX_PIXELS:
             raise ValueError(f"{right - left + 1}x{bottom - top + 1} px by its header")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}

@@ -23,7 +23,7 @@ SHAPE_STD = 0.12
 RELIEF_STD = 0.08
 """Relief that relative depth misses between two points: standard deviation of its ratio to their distance."""
 PRIOR_WEIGHT = 2.0  # lengths that `SHAPE_STD` counts as, beside the spread of those that are given
-MOST_MM = 1000.0
+MAX_MM = 1000.0
 ROUNDS = 20
 HUBER = 1.345  # residuals beyond so many standard deviations weigh less
 Read = Callable[[int], tuple[NDArray[np.float32], NDArray[np.bool_]]]
@@ -53,8 +53,8 @@ def parse_known_length(text: str, option: str = OPTION) -> KnownLength:
         found = KnownLength(int(frame), (x1, y1), (x2, y2), mm)
     except ValueError:
         raise input_error(option, FORM, repr(text), EXAMPLE) from None
-    if not 0 < mm <= MOST_MM:
-        raise input_error(option, f"a length above 0, up to {MOST_MM:g} mm", f"{mm:g} in {text}", EXAMPLE)
+    if not 0 < mm <= MAX_MM:
+        raise input_error(option, f"a length above 0, up to {MAX_MM:g} mm", f"{mm:g} in {text}", EXAMPLE)
     if not np.isfinite((x1, y1, x2, y2)).all() or (x1, y1) == (x2, y2):
         raise input_error(option, "two different points", text, EXAMPLE)
     return found
@@ -146,9 +146,9 @@ def scale_between(
     """
     check_shape("points:2,3", points=points)
     units, factor = float(np.linalg.norm(points[0] - points[1])), old.factor if old else 1.0
-    if not (0 < mm <= MOST_MM and units > 0):
+    if not (0 < mm <= MAX_MM and units > 0):
         got = f"{mm:g} mm" if units > 0 else "one point"
-        raise input_error(what, f"two points and a length above 0, up to {MOST_MM:g} mm", got, "enter the length.")
+        raise input_error(what, f"two points and a length above 0, up to {MAX_MM:g} mm", got, "enter the length.")
     pixels = float(np.linalg.norm(np.subtract(*project(points, camera)[0])))
     demand_plausible(what, mm / units * factor)
     return Scale(mm / units * factor, length_std(max(pixels, 1.0), camera.fx), f"known length in frame {frame}")

@@ -22,15 +22,15 @@ from .reading import read_only_array
 
 JPEG_ERROR = 32  # largest compression error next to an outline, in levels 0..255
 FLAT_ERROR = 2  # largest compression error inside of a region
-MOST_LABELS = 32  # with more values, those near the lowest and the highest one are compression errors
-MOST_AREA = 0.5  # labels that cover a larger share of the images may be tissue as well
+MAX_LABELS = 32  # with more values, those near the lowest and the highest one are compression errors
+MAX_AREA = 0.5  # labels that cover a larger share of the images may be tissue as well
 MIN_LABEL_SHARE = 0.05  # values between that are a smaller share of such an area are errors, not labels
 COLOR = 1 << 56
 """Colors are numbers from here on, with 16 bits for each of red, green and blue; black and grays are their level."""
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
 LOSSY = (".jpg", ".jpeg", ".webp")
-MOST_LABEL_COLORS = 256  # a file with more colors is a photo, not a mask
-LEAST_CERTAINTY = 0.5  # if the detected polarity is less certain, high values mark tools by convention
+MAX_LABEL_COLORS = 256  # a file with more colors is a photo, not a mask
+MIN_CERTAINTY = 0.5  # if the detected polarity is less certain, high values mark tools by convention
 OPTION = "--mask-labels"
 Mask = NDArray[np.bool_]
 Label = TypeVar("Label")
@@ -100,7 +100,7 @@ def high_values(tally: Tally) -> HighValues:
     full = 255 if highest <= 255 else 65535
     # An image that was compressed before has values next to both ends.
     compressed = {lowest + 1, highest - 1} <= tally.pixels.keys() and highest == full
-    uneven = not colors and (tally.lossy or compressed or len(numbers) > MOST_LABELS)
+    uneven = not colors and (tally.lossy or compressed or len(numbers) > MAX_LABELS)
     margin = JPEG_ERROR * highest / full if uneven else 0
     between = [number for number in numbers if lowest + margin < number < highest - margin]
     count = sum(tally.pixels[number] for number in between)
@@ -114,10 +114,10 @@ def high_values(tally: Tally) -> HighValues:
         return two if known else HighValues(0, labels=tuple(numbers), doubt=f"the colors {names(numbers)}")
     area = sum(count for number, count in tally.pixels.items() if number > margin)
     share = area / sum(tally.pixels.values())
-    if share > MOST_AREA and 0 in tally.pixels and count < MIN_LABEL_SHARE * area:
+    if share > MAX_AREA and 0 in tally.pixels and count < MIN_LABEL_SHARE * area:
         return HighValues(half)
     doubt = f"the labels {names(numbers)}, those above 0 on {share:.0%} of the pixels"
-    known = 0 in tally.pixels and share <= MOST_AREA
+    known = 0 in tally.pixels and share <= MAX_AREA
     labels = () if tally.lossy else tuple(numbers)
     return HighValues(JPEG_ERROR if tally.lossy else 0, labels=labels, doubt="" if known else doubt)
 
@@ -236,7 +236,7 @@ def tool_polarity(
     if tool_value != "auto":
         return Polarity(tool_value == "high", 1.0, f"{tool_value} values mark tools (--mask-tool-value)")
     detected = mask_polarity(highs, images)
-    if detected.certainty < LEAST_CERTAINTY:
+    if detected.certainty < MIN_CERTAINTY:
         reason = f"detection unclear, high values mark tools by convention: {detected.reason}"
         return Polarity(True, detected.certainty, reason)
     value = "high" if detected.tool_is_high else "low"
@@ -275,7 +275,7 @@ def _of_colors(path: Path, pixels: NDArray) -> NDArray:
     if lossy:
         return np.where(color.max(-1) > 2 * JPEG_ERROR, 255, 0).astype(np.uint8)
     numbers = color.astype(np.int64) @ np.array([1, 1 << 16, 1 << 32]) + COLOR  # blue first
-    if len(np.unique(numbers)) > MOST_LABEL_COLORS:
+    if len(np.unique(numbers)) > MAX_LABEL_COLORS:
         raise input_error(path, "a mask", "an image of many colors", "Pass masks, not photos or overlays.")
     is_gray = np.ptp(color, axis=-1) == 0
     return np.where(is_gray, color[..., 1].astype(np.int64), numbers)

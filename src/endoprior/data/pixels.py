@@ -13,10 +13,10 @@ from ..core.config import DataConfig
 from ..core.types import SURE_DEPTH, Camera, Frame
 
 GAP = 1.5  # a number is a filling if it is larger than all others by this factor ...
-FEWEST = 8  # ... and occurs in at least so many pixels, which measured depth at such a distance does not
+MIN_FAR_PIXELS = 8  # ... and occurs in at least so many pixels, which measured depth at such a distance does not
 FARTHEST = 20.0  # depth beyond so many times the median of an image is an error of measurement
 CLIP_PERCENTILES = (3.0, 99.8)  # measured depths of a frame are clipped to these percentiles of themselves
-LEAST_PIXELS = 100  # the median of fewer says nothing
+MIN_MEDIAN_PIXELS = 100  # the median of fewer says nothing
 STEPS_APART = 4.0  # a flat patch is filled if its edge is so many times as high as the usual step between two pixels
 USUAL_STEPS = 90  # percentile of the steps that are not 0: edges of tools are among them, and are no usual ones
 
@@ -49,11 +49,11 @@ def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]
         values = stored[measured]
         largest = values.max()
         is_largest = values == largest
-        is_far = FEWEST <= is_largest.sum() < values.size and largest > GAP * float(values[~is_largest].max())
+        is_far = MIN_FAR_PIXELS <= is_largest.sum() < values.size and largest > GAP * float(values[~is_largest].max())
         if is_far or (not relative and _is_filling(stored, measured, largest)):
             measured &= stored != largest
             continue
-        if values.size < LEAST_PIXELS or largest <= FARTHEST * float(values.min()):  # then none is beyond
+        if values.size < MIN_MEDIAN_PIXELS or largest <= FARTHEST * float(values.min()):  # then none is beyond
             break
         return measured & (stored <= FARTHEST * float(np.median(values)))
     return measured
@@ -68,7 +68,7 @@ def _is_filling(stored: NDArray, measured: NDArray[np.bool_], number: float) -> 
     filled = measured & (stored == number)
     has_patch = cv2.erode(filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0).any()
     rest = measured & ~filled
-    if not has_patch or not LEAST_PIXELS <= rest.sum() > filled.sum():
+    if not has_patch or not MIN_MEDIAN_PIXELS <= rest.sum() > filled.sum():
         return False
     values, steps, edges = np.where(measured, stored, 0).astype(np.float64), [], []
     for now, before in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):

@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 
-MOST_BYTES = 1 << 30  # largest size of one file, also after decompression
-MOST_PIXELS = 64_000_000  # of one image; 7680x4320 has half as many. `system/surroundings.py` tells OpenCV the same
-MOST_TEXT_BYTES = 64 << 20  # largest size of a JSON, YAML or text file
-MOST_ARRAYS = 1000  # in one .npz file
-MOST_NODES = 100_000  # entries of a YAML text, each alias counted as often as it is used
-MOST_NESTED = 50
+MAX_BYTES = 1 << 30  # largest size of one file, also after decompression
+MAX_PIXELS = 64_000_000  # of one image; 7680x4320 has half as many. `system/surroundings.py` tells OpenCV the same
+MAX_TEXT_BYTES = 64 << 20  # largest size of a JSON, YAML or text file
+MAX_ARRAYS = 1000  # in one .npz file
+MAX_NODES = 100_000  # entries of a YAML text, each alias counted as often as it is used
+MAX_NESTED = 50
 ACCESS_HINT = "check the path and its permissions."
 Kind = Literal["a file", "a folder", "nothing", "a device or a pipe"]
 _BROKEN = (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError)
@@ -67,7 +67,7 @@ def reading(path: Path, expected: str = "a readable file", fix: str = ACCESS_HIN
         raise input_error(path, expected, error.strerror or str(error), fix) from None
 
 
-def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> None:
+def demand_file(path: Path, expected: str, fix: str, most: int = MAX_BYTES) -> None:
     """Raise InputError unless `path` is a regular file of at most `most` bytes."""
     kind = kind_of(path)
     if kind != "a file":
@@ -89,7 +89,7 @@ def read_text(path: Path, expected: str, fix: str, *, or_latin_1: bool = False) 
     Args:
         or_latin_1: read other bytes as Latin-1, where only comments can have them.
     """
-    demand_file(path, expected, fix, MOST_TEXT_BYTES)
+    demand_file(path, expected, fix, MAX_TEXT_BYTES)
     try:
         with path.open("rb") as file:
             encoding = _encoding(file.read(4))
@@ -136,8 +136,8 @@ def _archive(stored: bytes) -> dict[str, NDArray]:
         members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
         # Python's zipfile never decompresses a member to more than its header says.
         size = sum(member.file_size for member in members)
-        if size > MOST_BYTES or len(members) > MOST_ARRAYS:
-            raise ValueError(f"{len(members)} arrays of {size >> 20} MB; at most {MOST_BYTES >> 20} MB are read")
+        if size > MAX_BYTES or len(members) > MAX_ARRAYS:
+            raise ValueError(f"{len(members)} arrays of {size >> 20} MB; at most {MAX_BYTES >> 20} MB are read")
         return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
 
 
@@ -168,8 +168,8 @@ class BoundedLoader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         """One node; an error if it is nested too deeply, before the parser's own stack overflows."""
         self._depth += 1
-        if self._depth > MOST_NESTED:
-            raise yaml.YAMLError(f"entries nested more than {MOST_NESTED} deep")
+        if self._depth > MAX_NESTED:
+            raise yaml.YAMLError(f"entries nested more than {MAX_NESTED} deep")
         try:
             return super().compose_node(parent, index)
         finally:
@@ -178,8 +178,8 @@ class BoundedLoader(yaml.SafeLoader):
     def get_single_node(self) -> Any:
         """The whole text; an error if it has too many entries."""
         node = super().get_single_node()
-        if node is not None and (size := _unfolded(node, {}, 0)) > MOST_NODES:
-            raise yaml.YAMLError(f"{size:.0e} entries, aliases counted as often as used; at most {MOST_NODES} are read")
+        if node is not None and (size := _unfolded(node, {}, 0)) > MAX_NODES:
+            raise yaml.YAMLError(f"{size:.0e} entries, aliases counted as often as used; at most {MAX_NODES} are read")
         return node
 
 
@@ -197,8 +197,8 @@ def _unfolded(node: yaml.Node, known: dict[int, int], depth: int) -> int:
         if not known[id(node)]:
             raise yaml.YAMLError("an entry that contains itself")
         return known[id(node)]
-    if depth > MOST_NESTED:
-        raise yaml.YAMLError(f"entries nested more than {MOST_NESTED} deep")
+    if depth > MAX_NESTED:
+        raise yaml.YAMLError(f"entries nested more than {MAX_NESTED} deep")
     known[id(node)] = 0  # not known yet
     parts = node.value if isinstance(node, yaml.CollectionNode) else []
     if isinstance(node, yaml.MappingNode):

@@ -9,7 +9,7 @@ from typing import Any
 from ..core.checks import input_error
 from .description import SCALED
 
-LEAST_FACTOR, MOST_FACTOR = 0.02, 50.0
+MIN_FACTOR, MAX_FACTOR = 0.02, 50.0
 """Range of factors: relative depth has a median of 70, tissue is 1.4 mm to 3.5 m away."""
 GIVE_BOTH = "correct them, or remove all three."
 
@@ -35,8 +35,8 @@ class Scale:
 
 def demand_plausible(option: str, factor: float) -> None:
     """Raise InputError if tissue would be at no distance of an endoscope; `option` gave the factor."""
-    if not LEAST_FACTOR <= factor <= MOST_FACTOR:
-        want = f"a scale of {LEAST_FACTOR:g} to {MOST_FACTOR:g} mm per unit of relative depth"
+    if not MIN_FACTOR <= factor <= MAX_FACTOR:
+        want = f"a scale of {MIN_FACTOR:g} to {MAX_FACTOR:g} mm per unit of relative depth"
         raise input_error(option, want, f"{factor:.3g}", "correct the frame, the points or the length in mm.")
 
 

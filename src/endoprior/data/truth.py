@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..core.geometry import FARTHEST_MM, Strain
-from .description import LEAST, MOST, is_number
+from .description import MAX_NUMBER, MIN_NUMBER, is_number
 from .files import IMAGE_SUFFIXES, files_with, read_json
 from .frame_files import match_names
 from .images import Size, read_color, read_header
@@ -215,7 +215,9 @@ def open_right_eye(
     elif baseline is None:
         reason = "sequence.json has no baseline_mm, the distance between the cameras"
     elif not is_number(baseline):
-        reason = f"baseline_mm in sequence.json is {repr(baseline)[:60]}, not a number in [{LEAST:g}, {MOST:g}]"
+        reason = (
+            f"baseline_mm in sequence.json is {repr(baseline)[:60]}, not a number in [{MIN_NUMBER:g}, {MAX_NUMBER:g}]"
+        )
     elif relative:
         reason = "the scale of the depth is unknown, and the distance between the cameras is in mm"
     elif not (found := read_header(read_bytes(files[matched.files[0]]).tobytes())) or found[:2] != size:

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .reading import MOST_PIXELS
+from .reading import MAX_PIXELS
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -39,7 +39,7 @@ def open_container(path: Path) -> InputContainer:
 
     # The scheme keeps FFmpeg from reading a colon in the name as an address; the lists restrict it to this file. FFmpeg
     # may decode an image to open a file, whatever size the container states.
-    limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file", "max_pixels": str(MOST_PIXELS)}
+    limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file", "max_pixels": str(MAX_PIXELS)}
     return av.open(f"file:{path.absolute()}", options=limits)
 
 

@@ -36,9 +36,9 @@ from .score import Score
 
 TOLERANCE = 0.0075  # Distance up to which outlines agree, as a share of the image diagonal (Csurka et al., BMVC 2013)
 TIP = 0.9  # A tip begins at this share of the tool's length
-LEAST_TEXT = 0.3
+MIN_TEXT = 0.3
 """A masked region is the panel of a label, not a tool, if text or painted boxes are at least this share of it."""
-LEAST_PX = 7  # Smallest side of a painted rectangle, px
+MIN_RECTANGLE_PX = 7  # Smallest side of a painted rectangle, px
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """Rows and columns to half of a pixel's eight neighbors; the other half are the same steps back."""
@@ -279,14 +279,14 @@ def _labels(images: Sequence[Image], black: Mask, border: Mask, always_masked: M
     """(H, W) True on burned-in text, on painted rectangles, and on always masked regions that they cover largely."""
     boxes = resting_rectangles(images, TextDetector().find) if (always_masked & ~border).any() else []
     for x, y, width, height, area in components(black, 4)[1][1:].tolist():
-        if area == width * height and min(width, height) >= LEAST_PX:  # a dark tool has another shape
+        if area == width * height and min(width, height) >= MIN_RECTANGLE_PX:  # a dark tool has another shape
             boxes.append((x, y, width, height))
     text = np.zeros_like(always_masked)
     for x, y, width, height in boxes:
         text[y : y + height, x : x + width] = True
     regions, _ = components(always_masked, 4)
     pixels, of_text = (np.bincount(part, minlength=regions.max() + 1) for part in (regions.ravel(), regions[text]))
-    return text | ((of_text >= LEAST_TEXT * pixels)[regions] & always_masked)
+    return text | ((of_text >= MIN_TEXT * pixels)[regions] & always_masked)
 
 
 def boundary(mask: Mask, counted: Mask) -> Mask:

@@ -26,7 +26,7 @@ The moved frame is hard to beat: it has all texture, and the flow has seen the h
 BLURRED_DB = 28.0  # below, frames are so far off that they must at least beat simple references clearly:
 WRONG_OVER_MEAN_DB = 2.0  # the mean of all frames by this, else nothing was learned,
 FOLLOWED_DB = 3.0  # as the moved frame must, else not even flow follows this video
-LEAST_FRAMES = (0.8, 0.5)  # share of the frames that could be used
+MIN_FRAME_SHARES = (0.8, 0.5)  # share of the frames that could be used
 SLIP_PX = (4.0, 10.0)
 MEASURED = 0.5  # share of the tissue from which parallax tells the depth of the whole
 DEPTH_ERROR = (0.15, 0.35)
@@ -147,7 +147,7 @@ def _depth(scores: Mapping[str, float], facts: VerdictFacts) -> Iterator[tuple[i
 def _frames(facts: VerdictFacts) -> Iterator[tuple[int, str]]:
     """Whether enough of the video could be used."""
     if facts.share_used < 1:
-        least = [-limit for limit in LEAST_FRAMES]
+        least = [-limit for limit in MIN_FRAME_SHARES]
         yield _graded(-facts.share_used, least), f"only {facts.share_used:.0%} of the frames could be used"
     if facts.share_with_missed_tools > 0:
         share = facts.share_with_missed_tools

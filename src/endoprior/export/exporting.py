@@ -143,7 +143,7 @@ def _check_file(out: Path, suffixes: tuple[str, ...], name: str) -> None:
         raise input_error(out, want, f"{error.strerror}", "Choose another place.") from error
 
 
-MOST_FRAMES = 3
+MAX_FRAMES = 3
 INVISIBLE_DB = 60.0
 """At this PSNR the error is a quarter of a step of 8 bits."""
 
@@ -156,7 +156,7 @@ def loss_note(scene: Scene, out: Path, options: ExportOptions, chosen: ExportFor
     if chosen.read is None:
         return ""
     steps = selected_time_steps(scene, options)
-    some = [steps[k] for k in evenly_spaced(len(steps), MOST_FRAMES)]
+    some = [steps[k] for k in evenly_spaced(len(steps), MAX_FRAMES)]
     back = ROTATIONS[options.frame or chosen.default_axes].T
     errors = []
     for step in some:

@@ -231,16 +231,16 @@ def _page(title: str, remark: str, unit: str, about: dict[str, Any], data: bytes
 CHANNELS = ("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity", "r", "g", "b")
 CHANNELS += ("r1", "g1", "b1", "r2", "g2", "b2")
 OPACITY = CHANNELS.index("opacity")
-LARGEST = 65535
+MAX_UINT16 = 65535
 """Largest stored integer."""
 MAX_STEP_MM, STEP_PX = 0.1, 0.25
 """Centers are off by half a step: never by more than 0.05 mm, nor, at the working distance, by more than an eighth of a
 pixel on each axis."""
 QUAT_STEP, LOG_SCALE_STEP, OPACITY_STEP, COLOR_STEP, SLOPE_STEP = 1 / 255, 0.02, 1 / 1020, 1 / 255, 1 / 510
 """A component of the unit quaternion turns a Gaussian by less than half a degree; a scale is off by at most 1 %."""
-SMALLEST_SCALE_PX = 0.02
+MIN_SCALE_PX = 0.02
 """Scales below this at the working distance are stored as this: the renderer's blur is 27 times wider."""
-LARGEST_SLOPE = 8
+MAX_SLOPE = 8
 """A color would change by its whole range within an eighth of a standard deviation."""
 
 
@@ -298,7 +298,7 @@ def _quantize(raw: NDArray[np.float32], depths: NDArray[np.float32], first: int,
     step = np.repeat(steps, (3, 4, 3, 1, 3, 6))
     raw[:, ~finite] = 0
     middle = np.median(raw[:3, finite], axis=1)
-    within = (np.abs(raw[:3] - middle[:, None, None]) < step[:3, None, None] * (LARGEST // 2)).all(0)
+    within = (np.abs(raw[:3] - middle[:, None, None]) < step[:3, None, None] * (MAX_UINT16 // 2)).all(0)
     visible = finite & within & opaque
     kept = visible.any(0)
     if not kept.any():
@@ -308,12 +308,12 @@ def _quantize(raw: NDArray[np.float32], depths: NDArray[np.float32], first: int,
     low = np.zeros(len(CHANNELS))
     low[:3] = np.where(visible, raw[:3], np.inf).min((1, 2))
     low[3:7] = -1
-    low[7:10] = np.log(SMALLEST_SCALE_PX * near / focal)
-    low[14:] = -LARGEST_SLOPE
+    low[7:10] = np.log(MIN_SCALE_PX * near / focal)
+    low[14:] = -MAX_SLOPE
     raw[OPACITY] *= visible
     values = np.empty(raw.shape, np.uint16)
     for c in range(len(CHANNELS)):
-        values[c] = np.rint((raw[c] - float(low[c])) / float(step[c])).clip(0, LARGEST)
+        values[c] = np.rint((raw[c] - float(low[c])) / float(step[c])).clip(0, MAX_UINT16)
     # Where a Gaussian is invisible, its other numbers repeat those of the time step before: they compress to nothing.
     for channels in (values[:OPACITY], values[OPACITY + 1 :]):
         for t in range(1, len(visible)):

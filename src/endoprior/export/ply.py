@@ -21,7 +21,7 @@ from .axes import points_in_axes
 from .formats import TIME_STEP_OPTIONS, Axes, ExportFormat, ExportOptions
 from .time_steps import TimeStep
 
-LEAST_OPACITY = 1e-7
+MIN_OPACITY = 1e-7
 """Opacities are clipped to this distance from 0 and 1, because their logits would be infinite."""
 
 
@@ -45,7 +45,7 @@ def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment:
     docs/format.md), opacity (logit), scale_0..2 (log of mm), rot_0..3 (w, x, y, z, of length 1).
     """
     sh = splats.sh.numpy()
-    opacities = splats.opacities.numpy().astype(np.float64).clip(LEAST_OPACITY, 1 - LEAST_OPACITY)
+    opacities = splats.opacities.numpy().astype(np.float64).clip(MIN_OPACITY, 1 - MIN_OPACITY)
     columns = _numbered("xyz", splats.means.numpy()) | dict.fromkeys(("nx", "ny", "nz"), np.zeros(len(sh)))
     columns |= _numbered("f_dc_", sh[:, 0]) | _numbered("f_rest_", sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1))
     columns["opacity"] = np.log(opacities / (1 - opacities))

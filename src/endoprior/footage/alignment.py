@@ -22,7 +22,7 @@ FINE_SIGMA_PX, COARSE_SIGMA_PX = 1.5, 10.0  # detail between these scales is com
 OUTLIER = 2.5  # residuals beyond this many standard deviations count little (Geman-McClure)
 ROUNDS, CONVERGED_PX = 12, 0.02  # steps of Gauss-Newton on each level at most, and the step that ends them
 MIN_OVERLAP_SHARE, MIN_OVERLAP_PX = 0.3, 100.0  # share of the usable pixels that both images show, and their number
-LEAST_GAIN = 0.2  # contrast of one image as a multiple of the other's
+MIN_GAIN = 0.2  # contrast of one image as a multiple of the other's
 AGREEMENT = 0.6  # correlation of the aligned images; other scenes reach 0.45
 SURE_PX = 0.5  # standard deviation of the mean shift, px of the finest images
 ALIGNMENT_ROUND_TRIP_PX = 1.5  # distance between the way there and the way back, px of the finest images
@@ -153,7 +153,7 @@ def _refined(before: _Level, now: _Level, p: NDArray) -> _Fit | None:
         gx, gy = (cv2.Scharr(shown, cv2.CV_32F, *axis, scale=1 / 32)[used] for axis in ((1, 0), (0, 1)))
         there, here, uu, vv = shown[used], before.detail[used], u[used], v[used]
         gain, bias = np.polyfit(there, here, 1) if np.ptp(there) > 0 else (1.0, 0.0)
-        gain = max(float(gain), LEAST_GAIN)
+        gain = max(float(gain), MIN_GAIN)
         error = gain * there + bias - here
         sigma = 1.4826 * float(np.median(np.abs(error))) + 1e-4
         weight = (1 / (1 + (error / (OUTLIER * sigma)) ** 2)) ** 2

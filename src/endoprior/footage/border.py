@@ -20,18 +20,18 @@ from .dark_outline import Circle, Darkness, blurred, brightness, find_darkness, 
 from .round_border import find_circle
 
 IN_SAMPLES = 0.9  # The outside is dark in this share of the samples; glare reaches over a border now and then
-MOST_LEVEL = 20  # Median level of what can be outside
-LEVEL_STEP, MOST_SHARE = 1.25, 0.5  # Factor between levels that are tried; the last is this share of the usual level
+MAX_LEVEL = 20  # Median level of what can be outside
+LEVEL_STEP, MAX_SHARE = 1.25, 0.5  # Factor between levels that are tried; the last is this share of the usual level
 REACH = 0.006  # Length within which a sharp outline becomes bright, in sides of the image ...
-LEAST_REACH_PX = 3
-RATIO, MOST_OF = 2.5, 0.5  # ... by this factor at least, and to this share of the level further inside
-LEAST_PICTURE, LEAST_OUTSIDE = 0.05, 0.001  # Shares of the frame: of the endoscope image, and of one part outside
+MIN_REACH_PX = 3
+RATIO, MAX_OF = 2.5, 0.5  # ... by this factor at least, and to this share of the level further inside
+MIN_PICTURE, MIN_OUTSIDE = 0.05, 0.001  # Shares of the frame: of the endoscope image, and of one part outside
 SHARP, ALIKE = 0.6, 0.02  # Least sharp share of an outline, and by how much less is as good as the best
 FLAT = 3.0  # A part outside that cuts into the image is so many times longer along its edge than deep
-FADED, MOST_RIM = 0.8, 4  # The rim has less than this share of the level deeper inside; its largest width, in reaches
+FADED, MAX_RIM = 0.8, 4  # The rim has less than this share of the level deeper inside; its largest width, in reaches
 CERTAIN = 0.9  # Below this sharp share of its outline, a border is uncertain
 MOVES = 0.002  # A border moves if it hides this share of the frame in half of the samples
-LEAST_EXPLAINED, NEAR = 0.6, 0.01  # Share of the outline that lies on its circle, as near as this share of the radius
+MIN_EXPLAINED, NEAR = 0.6, 0.01  # Share of the outline that lies on its circle, as near as this share of the radius
 ONE_SIDED = 0.5  # Length of the mean of unit vectors from its center: an arc of 220 degrees; 0 for opposite arcs
 ANOTHER = 0.1  # Another image in the frame has at least this share of the area of the largest
 
@@ -57,7 +57,7 @@ def find_outside(images: Sequence[Image], inside: Mask | None = None) -> Outside
     grays = [blurred(brightness(image)) for image in images]
     inside = np.ones(grays[0].shape, bool) if inside is None else inside
     darkness = find_darkness(reduced(grays)[0])
-    if darkness is None or darkness.level >= MOST_LEVEL or not inside.any():
+    if darkness is None or darkness.level >= MAX_LEVEL or not inside.any():
         return Outside(np.zeros_like(inside))
     rank = int(IN_SAMPLES * (len(grays) - 1))
     usual = np.partition(np.stack(grays), rank, axis=0)[rank]
@@ -84,14 +84,14 @@ def hidden_by_moving_border(image: Image, level: float, inside: Mask) -> Mask:
         inside: (H, W) True where the clip shows something.
     """
     found = _cut(blurred(brightness(image)), level, Darkness(0.0, level / 4), inside).mask
-    return dilated(found, square(LEAST_REACH_PX)) & inside if found.any() else found
+    return dilated(found, square(MIN_REACH_PX)) & inside if found.any() else found
 
 
 def _levels(usual: Image, darkness: Darkness) -> list[float]:
     """Levels that may separate the outside, ascending."""
     first = darkness.level + darkness.step
     lit = usual[usual > first]
-    last = max(MOST_SHARE * float(np.median(lit)) if lit.size else 0.0, first)
+    last = max(MAX_SHARE * float(np.median(lit)) if lit.size else 0.0, first)
     return [first * LEVEL_STEP**i for i in range(int(np.log(last / first) / np.log(LEVEL_STEP)) + 1)]
 
 
@@ -101,7 +101,7 @@ def _cut(gray: Image, level: float, darkness: Darkness, inside: Mask) -> Outside
     core = cv2.morphologyEx(((gray > level) & inside).astype(np.uint8), cv2.MORPH_OPEN, disk(reach)) > 0
     regions, boxes = components(core, 4)
     areas = boxes[1:, AREA]
-    if not areas.size or areas.max() < LEAST_PICTURE * gray.size:
+    if not areas.size or areas.max() < MIN_PICTURE * gray.size:
         return Outside(np.zeros_like(inside), 0.0, level)
     picture = regions == 1 + int(areas.argmax())
     hull = np.zeros(gray.shape, np.uint8)
@@ -109,7 +109,7 @@ def _cut(gray: Image, level: float, darkness: Darkness, inside: Mask) -> Outside
     convex = (hull > 0) & inside
     low, high = (change(gray, square(reach)).astype(np.float32) for change in (cv2.erode, cv2.dilate))
     beside = cv2.dilate(cv2.blur(gray, (2 * reach + 1,) * 2), square(3 * reach))
-    sharp = high >= np.maximum(np.maximum(RATIO * low, low + 4 * darkness.step), MOST_OF * beside)
+    sharp = high >= np.maximum(np.maximum(RATIO * low, low + 4 * darkness.step), MAX_OF * beside)
     around, notch = inside & ~convex, convex & ~picture
     distance = distance_inside(np.pad(convex, 1))[1:-1, 1:-1]  # the edge of the image counts
     cut, cut_line, cut_clear = _parts(around, around & dilated(convex, square(1)), sharp)
@@ -128,7 +128,7 @@ def _parts(
     regions, boxes = components(dark, 4)
     count = len(boxes)
     line, clear = (np.bincount(regions[where], minlength=count) for where in (outline, outline & sharp))
-    chosen = (boxes[:, AREA] >= LEAST_OUTSIDE * dark.size) & (line > 0) & (clear >= SHARP * line)
+    chosen = (boxes[:, AREA] >= MIN_OUTSIDE * dark.size) & (line > 0) & (clear >= SHARP * line)
     if distance is not None:
         depth = np.zeros(count, np.float32)
         np.maximum.at(depth, regions[dark], distance[dark])
@@ -138,16 +138,16 @@ def _parts(
 
 
 def _reach(gray: Image) -> int:
-    return max(LEAST_REACH_PX, round(REACH * max(gray.shape)))
+    return max(MIN_REACH_PX, round(REACH * max(gray.shape)))
 
 
 def _rim(usual: Image, outside: Mask, inside: Mask) -> int:
     """Width of the darkened or blurred rim next to the outside, px."""
     reach = _reach(usual)
     distance = distance_inside(~outside)
-    deep = usual[(distance > MOST_RIM * reach) & (distance < 2 * MOST_RIM * reach) & inside]
+    deep = usual[(distance > MAX_RIM * reach) & (distance < 2 * MAX_RIM * reach) & inside]
     level = float(np.median(deep)) if deep.size else 0.0
-    for width in range(1, MOST_RIM * reach):
+    for width in range(1, MAX_RIM * reach):
         ring = usual[(distance >= width) & (distance < width + 1) & inside]
         if not ring.size or np.median(ring) >= FADED * level:
             return width
@@ -163,7 +163,7 @@ STATIC_RATIO = 0.3  # The change over time of a strip is below this share of the
 STRIP_CHROMA = 40  # ... and a strip is gray: the channels of half of its pixels differ by less than this.
 EDGE_SHARE, EDGE_STEP = 0.55, 12
 """Share of a strip's edge with a brightness step, and its least levels: unlike that of a shadow, it is straight."""
-FADING, MOST_FADING_PX = 0.8, 3
+FADING, MAX_FADING_PX = 0.8, 3
 """So many rows next to a strip belong to it if they have less than this share of the level two rows further inside."""
 
 
@@ -227,7 +227,7 @@ def _explains(circle: Circle, outline: Outline) -> bool:
     distance = np.linalg.norm(toward, axis=1)
     on = np.abs(distance - (circle.radius - circle.margin_px)) < max(NEAR * circle.radius, 2.0)
     one_sided = np.linalg.norm((toward[on] / distance[on, None]).mean(0)) if on.any() else 1.0
-    return bool(on.mean() > LEAST_EXPLAINED or one_sided < ONE_SIDED)
+    return bool(on.mean() > MIN_EXPLAINED or one_sided < ONE_SIDED)
 
 
 def masked_border(outline: Outline, images: Sequence[Image], tissue_masks: Iterable[Mask]) -> Mask:
@@ -282,6 +282,6 @@ def _strip_on_top(maps: list[NDArray], central_change: float) -> int:
     beside = slice(rows, rows + 6)
     level = [np.median(row[at]) if at.any() else 0.0 for row, at in zip(mean[beside], inside[beside], strict=True)]
     fading = 0
-    while fading < min(MOST_FADING_PX, len(level) - 3) and level[fading] < FADING * level[fading + 2]:
+    while fading < min(MAX_FADING_PX, len(level) - 3) and level[fading] < FADING * level[fading + 2]:
         fading += 1
     return rows + fading

@@ -21,13 +21,13 @@ from .optical_flow import MIN_SIZE_PX, flow_pair, flow_shrink, gray_for_flow
 CARRY_ROUND_TRIP_PX, CARRY_ROUND_TRIP_SHARE = 1.5, 0.1
 """A pixel returns if forward and backward flow disagree by at most this, px of the flow, plus this share of the step.
 DIS is exact to a fraction of a pixel where it follows the image, and wrong by several pixels where it does not."""
-LEAST_RETURNING = 0.5
+MIN_RETURNING = 0.5
 """Carrying stops where a smaller share of the region returns: the outline is uncertain, and the next step would start
 from it. At the rim of a tool, tissue appears and disappears; this never returns and is up to half of a thin region."""
-MOST_COLOR_CHANGE = 20.0
+MAX_COLOR_CHANGE = 20.0
 """Carrying stops where the median color of the region's pixels is this far from the corrected frame, in levels of 255:
 something else is there. Noise and video coding change it by less than 5, highlights only a part of the pixels."""
-LEAST_AREA = 0.5
+MIN_AREA = 0.5
 """Carrying stops where less than this share of the region is left: it leaves the image, or its motion was wrong."""
 AGREES = 0.95  # A mask that has this share of the correction already is left: its outline is better than a carried one
 SMOOTH_PX = 16.0
@@ -86,21 +86,21 @@ def _carry(
         before = gray
         gray, color = _small(frame_at(number))
         share, near = _follow(before, gray, region)
-        if share < LEAST_RETURNING:
+        if share < MIN_RETURNING:
             return f"frame {number}: the motion is uncertain; {share:.0%} of the region returns along the flow"
         positions = sampled(positions, near)
         # Small errors of each step add up. Compare with the corrected frame itself, where that is possible.
         expected = np.where(_unknown(positions), gray, sampled(start, positions))
         share, near = _follow(expected, gray, _moved(corrected, positions))
-        if share >= LEAST_RETURNING:
+        if share >= MIN_RETURNING:
             positions = sampled(positions, near)
         painted, erased = (_moved(part, positions) for part in (added, removed))
         region = painted | erased
-        if region.sum() < LEAST_AREA * size:
+        if region.sum() < MIN_AREA * size:
             return f"frame {number}: {region.sum() / size:.0%} of the region is left in the image"
         inside = _at_size(region, gray) > 0
         difference = cv2.absdiff(color, sampled(start_color, positions))[inside].mean(-1)
-        if (change := float(np.median(difference))) > MOST_COLOR_CHANGE:
+        if (change := float(np.median(difference))) > MAX_COLOR_CHANGE:
             return f"frame {number}: the color of the region changed by {change:.0f} of 255 levels"
         mask = mask_at(number)
         agrees = (painted & mask) | (erased & ~mask)

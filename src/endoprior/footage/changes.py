@@ -157,7 +157,7 @@ JUMP_RATIO = 6.0  # An exposure jump is this many times the usual change of brig
 JUMP_AGREEMENT = 0.85
 """... and this share of the image changes in the same direction. A tool that enters darkens only a part."""
 BLACK, SATURATED = 8, 245  # Gray levels between which brightness is compared
-LEAST_COMPARED = 0.1  # Share of the image of which brightness must be comparable
+MIN_COMPARED = 0.1  # Share of the image of which brightness must be comparable
 
 
 def _exposure_jumps(thumbs: Sequence[Gray]) -> tuple[int, ...]:
@@ -174,7 +174,7 @@ def _exposure_jumps(thumbs: Sequence[Gray]) -> tuple[int, ...]:
 def _exposure_step(before: NDArray, now: NDArray) -> tuple[float, float]:
     """Change of the logarithm of brightness, and the share of the pixels that change in its direction; 0 if unknown."""
     usable = (np.minimum(before, now) > BLACK) & (np.maximum(before, now) < SATURATED)
-    if usable.mean() < LEAST_COMPARED:
+    if usable.mean() < MIN_COMPARED:
         return 0.0, 0.0
     ratio = np.log(now[usable] / before[usable])
     step = float(np.median(ratio))

@@ -15,14 +15,14 @@ from .components import Image, Mask, dilated, large_regions, square
 WORKING_SIDE_PX = 640  # Larger images are reduced for the first guess; the circle is measured in full images later
 FEW = 9  # Number of images that tell what black is
 DARKEST_SHARE = 0.01  # A border covers at least this share of the image
-MOST_BLACK = 40  # A border is darker than this level
-LEAST_STEP = 4  # Smallest difference of levels between a border and the image
-LEAST_REGION = 0.001  # Smaller dark regions, as a share of the image, are ignored
+MAX_BLACK = 40  # A border is darker than this level
+MIN_BORDER_STEP = 4  # Smallest difference of levels between a border and the image
+MIN_REGION = 0.001  # Smaller dark regions, as a share of the image, are ignored
 LINE_SHARE = 0.2
 """An outline with this share of the image's width in one row, or of its height in one column, is a straight border."""
 HYPOTHESES = 6000  # Number of circles through three random points
 SCORED = 300  # Number of plausible ones to compare with all points
-MOST_POINTS = 1500  # Number of random points used for the comparison
+MAX_COMPARED_POINTS = 1500  # Number of random points used for the comparison
 TOLERANCE = 0.012  # Distance from the circle, in radii, beyond which a point does not count
 FACING = 0.9  # Least cosine between the direction to the center and that in which the image becomes brighter
 UNMEASURED_RIM = 0.025  # Share of the radius that is left out of a circle whose rim was not measured
@@ -89,12 +89,12 @@ def find_darkness(grays: Sequence[Image]) -> Darkness | None:
     smooth = np.stack([blurred(grays[i]) for i in evenly_spaced(len(grays), FEW)])
     typical = np.partition(smooth, (len(smooth) - 1) // 2, axis=0)[(len(smooth) - 1) // 2]
     darkest = float(np.quantile(typical, DARKEST_SHARE))
-    if darkest >= MOST_BLACK:
+    if darkest >= MAX_BLACK:
         return None
-    dark = smooth[:, typical <= darkest + LEAST_STEP]
+    dark = smooth[:, typical <= darkest + MIN_BORDER_STEP]
     level = float(np.median(dark))
     noise = 1.48 * float(np.median(np.abs(dark - level)))
-    return Darkness(level, float(np.clip(5 * noise, LEAST_STEP, MOST_BLACK)))
+    return Darkness(level, float(np.clip(5 * noise, MIN_BORDER_STEP, MAX_BLACK)))
 
 
 def outline_points(grays: Sequence[Image], darkness: Darkness) -> tuple[Points, Points]:
@@ -102,7 +102,7 @@ def outline_points(grays: Sequence[Image], darkness: Darkness) -> tuple[Points, 
     points: list[Points] = [np.empty((0, 2))]
     inward: list[Points] = [np.empty((0, 2))]
     for gray in grays:
-        dark = large_regions(blurred(gray) <= darkness.level + darkness.step, LEAST_REGION * gray.size, 4)
+        dark = large_regions(blurred(gray) <= darkness.level + darkness.step, MIN_REGION * gray.size, 4)
         edge = dilated(dark, square(1)) & ~dark & ~_lines(dark)
         edge[:2] = edge[-2:] = edge[:, :2] = edge[:, -2:] = False
         y, x = np.nonzero(edge)
@@ -142,7 +142,7 @@ def likely_circle(points: Points, inward: Points, width: int, height: int) -> Po
     circles = circles[plausible & facing.all(1)][:SCORED]
     if not len(circles):
         return None
-    chosen = rng.permutation(len(points))[:MOST_POINTS]
+    chosen = rng.permutation(len(points))[:MAX_COMPARED_POINTS]
     best = circles[int(np.argmax([_weights(c, points[chosen], inward[chosen]).sum() for c in circles]))]
     for _ in range(5):
         weights = _weights(best, points, inward)

@@ -77,7 +77,7 @@ UNFOCUSED, BLUR_RATIO = 0.3, 0.45
 """An image is blurred if its focus is below the first, or below this share of that of its neighbors."""
 HAZE_RATIO, HAZE_RISE = 0.45, 0.08
 """Haze leaves less than this share of the contrast of the neighbors, and raises the floor by at least so much."""
-LEAST_CONTRAST = 0.04  # of the clear neighbors; with less, haze cannot be told from smooth tissue
+MIN_CONTRAST = 0.04  # of the clear neighbors; with less, haze cannot be told from smooth tissue
 RED, GRAY, COLD, GREEN, APART, HUES = 0.08, 0.03, -0.03, 0.325, 0.08, 1.15
 """The inside of a body is redder than its next color by the first. A scene is outside if that excess is below the
 second, its share of green is above the fourth, its shares differ by the fifth from those of the clip, and it has more
@@ -110,7 +110,7 @@ def disturbances(
             )
             if focus[i] < max(UNFOCUSED, BLUR_RATIO * usual):
                 words[i], weights[i] = "blur", max(focus[i] / max(usual, 2 * UNFOCUSED), FLOOR_WEIGHT)
-            elif clear >= LEAST_CONTRAST and contrast[i] < HAZE_RATIO * clear and floor[i] > low + HAZE_RISE:
+            elif clear >= MIN_CONTRAST and contrast[i] < HAZE_RATIO * clear and floor[i] > low + HAZE_RISE:
                 words[i], weights[i] = "smoke", max(contrast[i] / clear, FLOOR_WEIGHT)
     return words, weights
 

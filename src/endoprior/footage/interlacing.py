@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from .components import Image
 
 Levels = NDArray[np.float32]  # gray values, 0 to 255
-BLOCK_PX, LEAST_BLOCKS = 16, 8
-LEAST_MOTION = 1.0  # mean difference of a block between two images, levels of 255, above which something moves in it
+BLOCK_PX, MIN_BLOCKS = 16, 8
+MIN_MOTION = 1.0  # mean difference of a block between two images, levels of 255, above which something moves in it
 UNEQUAL = 0.06
 """Least median of `unequal_rows`, without its sign. Progressive clips, dithered too, have up to 0.02; woven ones 0.15
 or more, and 0.12 or more if every second image is left out.
 """
-LEAST_DIFFERENCE = 3.0  # mean difference of neighboring rows, levels of 255, above which a block has structure
+MIN_DIFFERENCE = 3.0  # mean difference of neighboring rows, levels of 255, above which a block has structure
 ALTERNATING = 1.3  # such a block alternates if rows next to each other differ more than rows two apart, by this factor
 ROWS_ALONE = 2.0  # and that factor is so many times the same one of columns
 COMBED_SHARE = 0.5  # least share of alternating blocks, of those with structure; dithered images have up to 0.18
 COMBED_IMAGES = 0.1  # least share of images with so many of them
-FEWEST, MOST = 3, 24  # pairs of images that are compared
+MIN_PAIRS, MAX_PAIRS = 3, 24  # pairs of images that are compared
 
 
 class Interlacing:
@@ -45,7 +45,7 @@ class Interlacing:
             if self._count % self._every == 0:
                 before, now = _gray(self._before), _gray(image)
                 self._found.append((unequal_rows(before, now), is_combed(now)))
-            if len(self._found) == MOST:
+            if len(self._found) == MAX_PAIRS:
                 self._found, self._every = self._found[::2], 2 * self._every
             self._count += 1
         self._before = image
@@ -54,7 +54,7 @@ class Interlacing:
     def is_certain(self) -> bool:
         """Whether the images seen so far are interlaced."""
         unequal = [each for each, _ in self._found if each is not None]
-        if len(unequal) >= FEWEST and abs(float(np.median(unequal))) > UNEQUAL:
+        if len(unequal) >= MIN_PAIRS and abs(float(np.median(unequal))) > UNEQUAL:
             return True
         return sum(combed for _, combed in self._found) > COMBED_IMAGES * len(self._found)
 
@@ -66,8 +66,8 @@ def unequal_rows(before: Levels, now: Levels) -> float | None:
     """
     if not before.size:
         return None
-    moves = _of_blocks(cv2.absdiff(before, now)[1:-1]) > LEAST_MOTION
-    if np.count_nonzero(moves) < LEAST_BLOCKS:
+    moves = _of_blocks(cv2.absdiff(before, now)[1:-1]) > MIN_MOTION
+    if np.count_nonzero(moves) < MIN_BLOCKS:
         return None
     apart = cv2.absdiff(before[1:-1], (now[:-2] + now[2:]) / 2)
     odd, even = (float(_of_blocks(apart[first::2], BLOCK_PX // 2)[moves].mean()) for first in (0, 1))
@@ -81,9 +81,9 @@ def is_combed(levels: Levels) -> bool:
     inner = levels[:-2]
     rows, rows_apart = (_of_blocks(cv2.absdiff(levels[by : by - 2 or None], inner)) for by in (1, 2))
     columns, columns_apart = (_of_blocks(cv2.absdiff(inner[:, by:], inner[:, :-by])) for by in (1, 2))
-    is_structured, is_of_rows = rows > LEAST_DIFFERENCE, rows * columns_apart > ROWS_ALONE * columns * rows_apart
+    is_structured, is_of_rows = rows > MIN_DIFFERENCE, rows * columns_apart > ROWS_ALONE * columns * rows_apart
     combed = is_structured & is_of_rows & (rows > ALTERNATING * rows_apart)
-    return bool(combed.sum() >= max(LEAST_BLOCKS, COMBED_SHARE * is_structured.sum()))
+    return bool(combed.sum() >= max(MIN_BLOCKS, COMBED_SHARE * is_structured.sum()))
 
 
 def _gray(image: Image) -> Levels:

@@ -19,7 +19,7 @@ from .components import AREA, Image, InOrder, Mask, components, disk, distance_i
 from .optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 
 SIDE_PX = 160  # shorter side of the images that are compared
-COMPARED, FEWEST = 24, 8  # pairs of frames; with fewer in which the tissue moves, nothing is said
+COMPARED, MIN_PAIRS = 24, 8  # pairs of frames; with fewer in which the tissue moves, nothing is said
 MOVES_PX = 1.0  # the tissue moves if its median flow is above this, px
 WITH_TISSUE = 0.3  # difference to the motion of the tissue, as a share of that: 0.04 on tissue, 1 on tools (medians)
 NEARLY_ALL = 0.9  # share of the pairs
@@ -50,7 +50,7 @@ def find_masked_tissue(
     found = list(each(lambda i: _likest(color(i), color(i + ahead), tool(i), tool(i + ahead)), first))
     moving = [(i, ratio, place) for i, (speed, ratio, place) in zip(first, found, strict=True) if speed > MOVES_PX]
     alike = [(i, place) for i, ratio, place in moving if ratio < WITH_TISSUE]
-    if len(moving) < FEWEST or len(alike) < NEARLY_ALL * len(moving):
+    if len(moving) < MIN_PAIRS or len(alike) < NEARLY_ALL * len(moving):
         return None
     frame, (x, y) = alike[len(alike) // 2]
     return MaskedTissue(frame, x, y)

@@ -25,9 +25,9 @@ WORK_WIDTH = 320  # Wider images are resized to this width, px
 STARTS = 10  # Number of frames from which corners are followed
 REACH = 24  # ... over so many frames at most ...
 FAR = 0.05  # ... or until they have moved by this share of the image width (median).
-MAX_CORNERS, FEWEST = 200, 40
+MAX_CORNERS, MIN_CORNERS = 200, 40
 EDGE_STEP = 0.05  # No corners where depth changes by more than this share between neighbors
-LEAST_PX = 1.0  # Errors below this, px of an image 640 px wide, come from corners and tissue: nothing is wrong
+MIN_ERROR_PX = 1.0  # Errors below this, px of an image 640 px wide, come from corners and tissue: nothing is wrong
 AS_GOOD = 1.15  # Conventions whose errors differ by less than this factor are not told apart
 NONE_PX, NONE_FIT = 3.0, ((1.05, 3.0), (0.6, 10.0))
 """Poses do not fit at all if their error is above the first, px, and above both multiples of one pair: of the error
@@ -59,7 +59,7 @@ class PoseFit:
     @property
     def another_fits(self) -> bool:
         """Whether another convention or unit fits clearly better than the given one."""
-        return self.given_px > LEAST_PX and self.best_px < min(CLEARLY * self.given_px, STILL * self.still_px)
+        return self.given_px > MIN_ERROR_PX and self.best_px < min(CLEARLY * self.given_px, STILL * self.still_px)
 
     @property
     def none_fits(self) -> bool:
@@ -212,11 +212,11 @@ def _follow(view: Callable[[int], RgbdFrame], matrix: NDArray, start: int, count
     kept, pixels, last = np.arange(len(before)), before, start
     for index in range(start + 1, min(start + REACH + 1, count)):
         following, tissue, _ = view(index)
-        if len(kept) < FEWEST:
+        if len(kept) < MIN_CORNERS:
             return None
         there, good = follow_both_ways(gray, following, pixels)
         good &= _sampled(tissue, there) > 0
-        if good.sum() < FEWEST:
+        if good.sum() < MIN_CORNERS:
             break
         kept, pixels, gray, last = kept[good], there[good], following, index
         if np.median(np.linalg.norm(pixels - before[kept], axis=1)) > FAR * gray.shape[1]:

@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 from .components import Image, Mask
 from .dark_outline import Circle, Points, brightness, find_darkness, likely_circle, outline_points, reduced
 
-LEAST_AGREEMENT = 0.35  # Share of the visible circle on which the images show a border, if anything is lit there
+MIN_AGREEMENT = 0.35  # Share of the visible circle on which the images show a border, if anything is lit there
 CERTAIN = 0.6  # Below this share, the border is uncertain, and only one with a sharp edge counts:
 SHARP = 0.55  # share of the level inside that is lost across a sharp edge, median
-LEAST_ARC_DEGREES = 40  # Sum of the arcs on which the images show a border
-LEAST_HITS = 0.25  # Share of the images that show an angle's border, of those that show anything there
-LEAST_OUTSIDE = 0.01  # Share of the image that a round border leaves dark
-MOST_MARGIN = 0.1  # Largest share of the radius for rim and movement together
-MOST_CONTRADICTION = 0.5
+MIN_ARC_DEGREES = 40  # Sum of the arcs on which the images show a border
+MIN_HITS = 0.25  # Share of the images that show an angle's border, of those that show anything there
+MIN_OUTSIDE = 0.01  # Share of the image that a round border leaves dark
+MAX_MARGIN = 0.1  # Largest share of the radius for rim and movement together
+MAX_CONTRADICTION = 0.5
 """Largest ratio of angles with an edge beside the circle to angles with an edge on it: another outline crosses it."""
-MOST_UNEVEN = 0.5
+MAX_UNEVEN = 0.5
 """Share of the tolerance within which four of five angles must lie: an ellipse fills the tolerance evenly."""
-MOST_LIT_OUTSIDE = 0.5  # Share of the outside that text and other displays may cover
+MAX_LIT_OUTSIDE = 0.5  # Share of the outside that text and other displays may cover
 BEND = (0.6, 1.4)  # Bounds of the border's curvature, in units of the circle's; 0 is a straight line
 SHARED_ANGLES = 0.25  # Share of the angles whose errors are independent
 BEND_ERROR = 0.2  # Largest standard error of that curvature
@@ -37,12 +37,12 @@ ANGLES = 360
 SEARCH = (0.02, 0.01, 0.005)
 """Standard deviation of the search around the circle, in radii: one round each, which reaches three times as far."""
 EDGE_WIDTH = 0.006  # Length over which levels are averaged on both sides of an edge, in radii
-LEAST_EDGE_PX = 1.5
-LEAST_CONTRAST = 0.4  # The level outside of an edge is lower by at least this share of the level inside
+MIN_EDGE_PX = 1.5
+MIN_CONTRAST = 0.4  # The level outside of an edge is lower by at least this share of the level inside
 DRIFT = 0.005  # Typical movement of the border in the image, in radii
 ANGLE_WEIGHT = 0.125  # Weight of one angle: neighbors have the same error
-LEAST_RIM, LEAST_RIM_PX = 0.005, 1.0  # Smallest rim, in radii and px
-MOST_RIM = 0.06  # Largest rim, in radii
+MIN_RIM, MIN_RIM_PX = 0.005, 1.0  # Smallest rim, in radii and px
+MAX_RIM = 0.06  # Largest rim, in radii
 TISSUE = (0.06, 0.12)  # Depths, in radii, that show tissue in all endoscopes
 RADIAL = 1.6  # In a rim the level changes this many times more across the border than deeper in the image
 FADED = 0.7  # A rim is darker than this share of the level that tissue's own fall-off leads to
@@ -95,7 +95,7 @@ def find_circle(images: Sequence[Image]) -> Circle | None:
     x, y, radius = start * factor
     edges = _measure_edges(grays, x, y, radius, darkness.level, darkness.step)
     agreement = _agreement(edges, small, factor)
-    if agreement < LEAST_AGREEMENT or (agreement < CERTAIN and np.median(edges.contrast[edges.hits]) < SHARP):
+    if agreement < MIN_AGREEMENT or (agreement < CERTAIN and np.median(edges.contrast[edges.hits]) < SHARP):
         return None
     # Where the border rests, and how far it moves; images with few edges do not count.
     shown = edges.hits.sum(1)
@@ -104,7 +104,7 @@ def find_circle(images: Sequence[Image]) -> Circle | None:
     low, high = np.quantile(centers, [0.02, 0.98], axis=0)
     center = (low + high) / 2
     drift = float(np.quantile(np.hypot(*(centers - center).T), 0.98))
-    rim = min(_measure_rim(edges) + drift, MOST_MARGIN * edges.radius)
+    rim = min(_measure_rim(edges) + drift, MAX_MARGIN * edges.radius)
     return Circle(float(center[0]), float(center[1]), edges.radius, rim, agreement)
 
 
@@ -116,16 +116,16 @@ def _agreement(edges: Edges, small: Sequence[Image], factor: float) -> float:
     if not plausible or not (0 < x < width and 0 < y < height):
         return 0.0
     supported, silent = _support(edges)
-    if supported.sum() * 360 / len(supported) < LEAST_ARC_DEGREES:
+    if supported.sum() * 360 / len(supported) < MIN_ARC_DEGREES:
         return 0.0
-    if _contradicted(edges).sum() > MOST_CONTRADICTION * supported.sum() or not _is_bent(edges, supported):
+    if _contradicted(edges).sum() > MAX_CONTRADICTION * supported.sum() or not _is_bent(edges, supported):
         return 0.0
     wide = Circle(x / factor, y / factor, 1.02 * edges.radius / factor)
     outside = ~wide.mask(small[0].shape[1], small[0].shape[0])
-    if outside.mean() < LEAST_OUTSIDE:
+    if outside.mean() < MIN_OUTSIDE:
         return 0.0
     lit = np.median(np.stack(small)[:, outside], axis=0) > edges.black + 2 * edges.step
-    if lit.mean() > MOST_LIT_OUTSIDE:
+    if lit.mean() > MAX_LIT_OUTSIDE:
         return 0.0
     counted = edges.visible & (supported | ~silent)
     return float(supported.sum() / max(counted.sum(), 1))
@@ -137,7 +137,7 @@ def _support(edges: Edges) -> tuple[Mask, Mask]:
     with np.errstate(invalid="ignore"):
         lit = np.nan_to_num(inner).mean(2) > edges.black + 2 * edges.step
     shown = (lit | edges.hits).sum(0)
-    enough = edges.hits.sum(0) >= np.maximum(LEAST_HITS * shown, 1)
+    enough = edges.hits.sum(0) >= np.maximum(MIN_HITS * shown, 1)
     return edges.visible & enough & (shown > 0), shown == 0
 
 
@@ -161,7 +161,7 @@ def _is_bent(edges: Edges, supported: Mask) -> bool:
     seen = np.flatnonzero(supported)
     values = np.array([np.nanmedian(error[:, a]) for a in seen])
     partial = supported.sum() < 0.8 * edges.visible.sum()  # an outline that stays near the circle everywhere is one
-    if partial and np.quantile(np.abs(values), 0.8) > MOST_UNEVEN * edges.tolerance_px:
+    if partial and np.quantile(np.abs(values), 0.8) > MAX_UNEVEN * edges.tolerance_px:
         return False
     top = bottom = squares = 0.0
     freedom = 0
@@ -215,7 +215,7 @@ def _measure_edges(grays: Sequence[Image], x: float, y: float, start: float, bla
     radius, centers = float(start), np.repeat([[x, y]], len(grays), 0)
     for search in SEARCH:
         step = max(radius / 1000, 0.5)
-        reach = 3 * search * radius + 2 * max(EDGE_WIDTH * radius, LEAST_EDGE_PX)
+        reach = 3 * search * radius + 2 * max(EDGE_WIDTH * radius, MIN_EDGE_PX)
         depths = np.arange(-reach, reach, step)
         levels = _profiles(grays, centers, radius, angles, depths)
         error, contrast = _edges(levels, depths, search * radius, radius, black, dark_step)
@@ -234,7 +234,7 @@ def _edges(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(K, A) distance of the edges outside of the circle, px, and their contrast; NaN where there is none."""
     step = depths[1] - depths[0]
-    count = max(round(max(EDGE_WIDTH * radius, LEAST_EDGE_PX) / step), 1)
+    count = max(round(max(EDGE_WIDTH * radius, MIN_EDGE_PX) / step), 1)
     above = np.maximum(levels - black, 0)
     sums = np.cumsum(np.nan_to_num(above), axis=2, dtype=np.float64)
     sums[np.isnan(levels)] = np.nan  # lines that leave the image have no edge there
@@ -244,7 +244,7 @@ def _edges(
     rise = inner - outer
     contrast = rise / np.maximum(inner, 1e-6)
     score = rise / (inner + 2 * dark_step) * np.exp(-0.5 * (at / search_px) ** 2)
-    score[~((rise > dark_step) & (contrast > LEAST_CONTRAST))] = 0  # also where there is no number
+    score[~((rise > dark_step) & (contrast > MIN_CONTRAST))] = 0  # also where there is no number
     best = score.argmax(2)[:, :, None]
     found = np.take_along_axis(score, best, 2)[:, :, 0] > 0
     contrast = np.take_along_axis(contrast, best, 2)[:, :, 0]
@@ -293,7 +293,7 @@ def _measure_rim(edges: Edges) -> float:
     depths = np.arange(0.0, TISSUE[1] * edges.radius, 0.5)
     rows = (edges.profiles(depths) - edges.black)[edges.hits]
     rows = rows[np.isfinite(rows).all(1)]
-    least = max(LEAST_RIM * edges.radius, LEAST_RIM_PX)
+    least = max(MIN_RIM * edges.radius, MIN_RIM_PX)
     tissue = depths >= TISSUE[0] * edges.radius
     normal = rows[:, tissue].mean(1)
     lit = normal > 2 * edges.step
@@ -305,6 +305,6 @@ def _measure_rim(edges: Edges) -> float:
     level = np.median(share, axis=0)
     is_rim = (level < FADED) | (level > 1 / FADED)
     is_rim[1:-1] |= change > RADIAL * usual
-    is_rim &= depths < MOST_RIM * edges.radius
+    is_rim &= depths < MAX_RIM * edges.radius
     last = float(depths[np.flatnonzero(is_rim)[-1]] + 1) if is_rim.any() else 0.0
-    return float(np.clip(last, least, MOST_RIM * edges.radius))
+    return float(np.clip(last, least, MAX_RIM * edges.radius))

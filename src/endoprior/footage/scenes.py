@@ -24,7 +24,7 @@ from .keypoints import alike, keypoints
 from .optical_flow import follow_both_ways
 
 CORNERS, FEATURES = 200, 400  # most corners that are followed, and features that are compared, in an image
-FEWEST = 12  # so many points must move together; of images of different places, up to 7 do by chance
+MIN_MATCHES = 12  # so many points must move together; of images of different places, up to 7 do by chance
 SHARE = 0.4  # share of the corners, or of the pairs of features, that must move together
 NEAR_PX, LIKE_PX = 2.0, 5.0  # largest distance of a point from where the common motion takes it: corners, features
 DISTINCT = 0.8  # a feature is found again if the second best candidate is farther from it by this factor
@@ -61,7 +61,7 @@ class GlobalMotion(NamedTuple):
 def flow_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     """The common motion of corners from an image to the next one; None if too few are found again."""
     corners = before.corners
-    if len(corners) < FEWEST:
+    if len(corners) < MIN_MATCHES:
         return None
     there, good = follow_both_ways(before.gray, now.gray, corners, side_px=15)
     return _link(corners[good], there[good], len(corners), NEAR_PX, now.gray.shape[1])
@@ -70,18 +70,18 @@ def flow_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
 def feature_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     """The common motion of features between any two images; None if too few are found again."""
     (first, first_like), (second, second_like) = before.features, now.features
-    if min(len(first), len(second)) < FEWEST:
+    if min(len(first), len(second)) < MIN_MATCHES:
         return None
     here, there = alike(first_like, second_like, DISTINCT)
     return _link(first[here], second[there], len(here), LIKE_PX, now.gray.shape[1])
 
 
 def _link(a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: float, width: int) -> GlobalMotion | None:
-    if len(a) < FEWEST:
+    if len(a) < MIN_MATCHES:
         return None
     cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator
     matrix, inliers = cv2.estimateAffinePartial2D(a, b, ransacReprojThreshold=near_px)
-    if matrix is None or inliers.sum() < FEWEST or inliers.sum() < SHARE * of:
+    if matrix is None or inliers.sum() < MIN_MATCHES or inliers.sum() < SHARE * of:
         return None
     x, y = np.meshgrid(*(np.linspace(side.min(), side.max(), 3) for side in a.T))
     grid = np.stack([x.ravel(), y.ravel()], 1)
@@ -100,7 +100,7 @@ def same_view(befores: Sequence[ImageFeatures], afters: Sequence[ImageFeatures])
 
 
 THUMB_WIDTH = 64  # images that follow each other are compared at this width, px
-LEAST_SPREAD = 8.0  # standard deviation of gray levels below which an image shows next to nothing
+MIN_SPREAD = 8.0  # standard deviation of gray levels below which an image shows next to nothing
 JUMP, JUMP_RATIO = 0.25, 3.0
 """Least change of the image at a cut, in standard deviations, and relative to the usual change around it."""
 ALIKE = 0.88  # largest correlation with the image before, shifted as fits best; what moves a little has more
@@ -114,7 +114,7 @@ AROUND_S = 0.5  # what is around it, s
 def standardized(thumb: NDArray) -> NDArray[np.float32]:
     """Gray values (h, w) as float32 of mean 0 and standard deviation 1, so that exposure does not matter."""
     values = thumb.astype(np.float32)
-    return (values - values.mean()) / max(float(values.std()), LEAST_SPREAD)
+    return (values - values.mean()) / max(float(values.std()), MIN_SPREAD)
 
 
 def change(before: NDArray[np.float32], now: NDArray[np.float32]) -> float:

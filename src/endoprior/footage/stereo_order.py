@@ -33,7 +33,7 @@ AGREE_PX = 1.0  # Tolerance of its left-right consistency check, px
 CLEARLY = 0.2  # The pair counts as swapped if the swapped order matches this much more of the image
 FEATURES = 1000  # Largest number of features per image
 RATIO = 0.75  # A feature's best match must be nearer than this times its second best (D. Lowe, IJCV 2004)
-FEWEST_MATCHES = 20  # With fewer matches the vertical offset is unknown
+MIN_MATCHES = 20  # With fewer matches the vertical offset is unknown
 
 
 def match_both_ways(
@@ -118,13 +118,13 @@ def stereo_order(left_u8: Image, right_u8: Image) -> StereoOrder:
 def vertical_offset_px(left_u8: Image, right_u8: Image) -> float:
     """Median |y_left - y_right| of matching features of a pair (H, W, 3), px, or NaN; below 0.5 if it is rectified."""
     offsets = np.abs(row_offsets_px(left_u8, right_u8))
-    return float(np.median(offsets)) if len(offsets) >= FEWEST_MATCHES else float("nan")
+    return float(np.median(offsets)) if len(offsets) >= MIN_MATCHES else float("nan")
 
 
 def row_offsets_px(left_u8: Image, right_u8: Image) -> NDArray[np.float64]:
     """(N,) y_right - y_left of each matching feature, px; arguments as for `vertical_offset_px`."""
     (left, left_like), (right, right_like) = (keypoints(camera, FEATURES) for camera in _gray(left_u8, right_u8))
-    if min(len(left), len(right)) < FEWEST_MATCHES:
+    if min(len(left), len(right)) < MIN_MATCHES:
         return np.zeros(0)
     of_left, of_right = alike(left_like, right_like, RATIO)
     return right[of_right, 1].astype(np.float64) - left[of_left, 1]

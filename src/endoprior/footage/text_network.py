@@ -26,12 +26,12 @@ SHA256 = "3439588c030faea393a54515f51e983d8e155b19a2e8aba7891934c1cf0de526"
 LONG_SIDE_PX = 640  # Larger images are shrunk to this longer side: that of a frame. Capitals of 8 px are found
 MULTIPLE = 32  # Sides of the network's image are multiples of this, px
 CORE = 0.3  # Least probability in the core of a line
-LEAST_SCORE = 0.6  # Least mean probability of a core
-LEAST_CORE_PX = 3  # Smallest side of a core, px of the network's image
+MIN_SCORE = 0.6  # Least mean probability of a core
+MIN_CORE_PX = 3  # Smallest side of a core, px of the network's image
 GROWTH = 1.8
 """A rectangle is its core, grown on each side by this times the core's area over its perimeter. The network was trained
 with cores that are shrunk so; 1.6 leaves the rim of some letters."""
-MOST_HEIGHT = 0.2  # Largest height of a line, in heights of the image: larger boxes are whole organs
+MAX_HEIGHT = 0.2  # Largest height of a line, in heights of the image: larger boxes are whole organs
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class TextDetector:
         regions, places = components(core > CORE)
         found = []
         for number, (left, top, width, height) in enumerate(places[1:, [LEFT, TOP, WIDTH, HEIGHT]].tolist(), 1):
-            if min(width, height) < LEAST_CORE_PX:
+            if min(width, height) < MIN_CORE_PX:
                 continue
             part = slice(top, top + height), slice(left, left + width)
             inside = regions[part] == number
@@ -105,7 +105,7 @@ class TextDetector:
             line = box_around(centers.astype(np.float32), score, 0.5)
             growth = GROWTH * line.length * line.height / (2 * (line.length + line.height))
             box = box_around(box_around(line.corners(), score, growth).corners() * enlarge, score)
-            if score >= LEAST_SCORE and box.height <= MOST_HEIGHT * rgb_u8.shape[0]:
+            if score >= MIN_SCORE and box.height <= MAX_HEIGHT * rgb_u8.shape[0]:
                 found.append(box)
         return sorted(found, key=lambda box: (box.y, box.x))
 

@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from .components import Image, Mask
 from .text_network import TextBox
 
-LEAST_SEEN = 3  # Images in which a text has to be found
-LEAST_MEAN_SCORE, RARE, RARE_SCORE = 0.75, 6, 0.9
+MIN_SEEN = 3  # Images in which a text has to be found
+MIN_MEAN_SCORE, RARE, RARE_SCORE = 0.75, 6, 0.9
 """Of the boxes of a text that rests: least mean score, and that of a text in fewer than `RARE` images. The slots of a
 tool that rests for a while have 0.82 in three images."""
-MOST_WANDER = 0.08  # Mean distance of the boxes of a text that rests from their line, in heights: tools have 0.2
+MAX_WANDER = 0.08  # Mean distance of the boxes of a text that rests from their line, in heights: tools have 0.2
 MIN_SHOWN_SHARE = 0.25  # Of the images from the first to the last one with a text that rests: so many show it
 SAME_PLACE = 0.7  # Boxes that share so much of the smaller one are at one place
 SAME_HEIGHT, SAME_LENGTH = 1.4, 1.25  # Largest ratios of heights, and of lengths, of one text
 LEVEL_DEGREES = 4.0  # Text that moves is level up to this
 MOVING_SCORE, FOLLOWED_SCORE = 0.9, 0.7  # Least scores of text that moves: to confirm it, and to follow it
-LEAST_ASPECT = 1.5  # Least length of text that moves, in heights
-SURE_SCORE, MOST_SEEN = 0.97, 0.85
+MIN_ASPECT = 1.5  # Least length of text that moves, in heights
+SURE_SCORE, MAX_SEEN = 0.97, 0.85
 """A text of this mean score that is in fewer than this share of the images from its first to its last one comes and
 goes, as labels of a detector do: it is looked for in every frame, like text that moves. Faint text is only missed."""
 JUMPS = 2  # In so many images a text has left its place for another one: then it moves
@@ -71,17 +71,17 @@ class Resting:
     def confirmed(self) -> bool:
         """Whether it is text rather than something that looks like it at times."""
         span = self.seen[-1] - self.seen[0] + 1
-        least = LEAST_MEAN_SCORE if len(self.seen) >= RARE else RARE_SCORE
-        if len(self.seen) < max(LEAST_SEEN, MIN_SHOWN_SHARE * span) or self._score < least:
+        least = MIN_MEAN_SCORE if len(self.seen) >= RARE else RARE_SCORE
+        if len(self.seen) < max(MIN_SEEN, MIN_SHOWN_SHARE * span) or self._score < least:
             return False
         _, across = self._spans()
-        return bool(np.abs(across.mean(1) - np.median(across.mean(1))).mean() < MOST_WANDER * self.box.height)
+        return bool(np.abs(across.mean(1) - np.median(across.mean(1))).mean() < MAX_WANDER * self.box.height)
 
     @property
     def comes_and_goes(self) -> bool:
         """Whether it is surely absent from images between its first and its last one."""
         span = self.seen[-1] - self.seen[0] + 1
-        return self._score >= SURE_SCORE and len(self.seen) < MOST_SEEN * span
+        return self._score >= SURE_SCORE and len(self.seen) < MAX_SEEN * span
 
     @property
     def _score(self) -> float:
@@ -120,7 +120,7 @@ def confirm(found: Sequence[list[TextBox]]) -> Texts:
     moving: list[TextBox] = []
     for _, box in loose:
         known = any(_alike(box, other) for other in moving)
-        if not known and len({image for image, other in loose if _alike(box, other)}) >= LEAST_SEEN:
+        if not known and len({image for image, other in loose if _alike(box, other)}) >= MIN_SEEN:
             moving.append(box)
     return Texts(sorted(resting, key=lambda text: (text.box.y, text.box.x)), moving)
 
@@ -167,7 +167,7 @@ def _axes(box: TextBox) -> NDArray[np.float64]:
 
 
 def _may_move(box: TextBox) -> bool:
-    return box.score >= MOVING_SCORE and abs(box.degrees) <= LEVEL_DEGREES and box.length >= LEAST_ASPECT * box.height
+    return box.score >= MOVING_SCORE and abs(box.degrees) <= LEVEL_DEGREES and box.length >= MIN_ASPECT * box.height
 
 
 def _alike(box: TextBox, other: TextBox) -> bool:

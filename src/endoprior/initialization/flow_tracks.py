@@ -37,7 +37,7 @@ from .neighbor_motion import fill_gaps, smooth_motion
 from .sampling import PointCloud, has_surface
 
 SPACING = 14  # largest number of frames between two anchors. With 6 the tracks of the phantoms are no better.
-LEAST_ANCHORS = 4  # also of a short sequence: a point that is hidden in one anchor is followed by way of another
+MIN_ANCHORS = 4  # also of a short sequence: a point that is hidden in one anchor is followed by way of another
 REACH = 48  # frames to both sides of an anchor to which flow is computed
 CYCLE_PX, CYCLE_SHARE = (0.25, 0.6), 0.5
 """A point is lost where forward and backward flow of its two steps disagree by more than a limit, px of the flow: that
@@ -113,7 +113,7 @@ def cycle_limit_px(error_px: NDArray[np.floating]) -> float:
 
 def anchors(count: int) -> list[int]:
     """Positions of the anchors among `count` frames: the middles of equal parts of at most `SPACING` frames."""
-    parts = max(-(-count // SPACING), min(count, LEAST_ANCHORS))
+    parts = max(-(-count // SPACING), min(count, MIN_ANCHORS))
     return [int((i + 0.5) * count / parts) for i in range(parts)]
 
 

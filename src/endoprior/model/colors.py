@@ -61,7 +61,7 @@ def _fixed(scene: SingleScene, times: NDArray[np.float64]) -> SingleScene:
 
 ITERATIONS, FEW_ITERATIONS = 20, 5
 """Twice as many gain 0.2 dB; the few lose 0.9 dB."""
-LEAST_ALPHA, LEAST_WEIGHT = 1e-3, 1e-2
+MIN_ALPHA, MIN_WEIGHT = 1e-3, 1e-2
 """Pixels and Gaussians with less count as if they had this much: nothing is known of them."""
 
 
@@ -77,7 +77,7 @@ def one_color(
     rasterize, black = render.load(backend), splats.means.new_zeros(3)
     with torch.no_grad():
         seen = rasterize(splats, camera, background=black)
-    target, alpha = seen.color.clamp(0, 1), seen.alpha.clamp(min=LEAST_ALPHA)[..., None]
+    target, alpha = seen.color.clamp(0, 1), seen.alpha.clamp(min=MIN_ALPHA)[..., None]
 
     def pulled_back(sh_dc: Tensor, picture: Tensor | None) -> Tensor:
         # A^T times a picture, or times what is left of the target, each pixel by its row's sum; (N, 1, 3).
@@ -89,7 +89,7 @@ def one_color(
 
     least, most = (0 - 0.5) / SH_C0, (1 - 0.5) / SH_C0
     found = ahead = splats.sh[:, :1].detach().clamp(least, most)
-    weights = pulled_back(found, torch.ones_like(target)).clamp(min=LEAST_WEIGHT) * SH_C0
+    weights = pulled_back(found, torch.ones_like(target)).clamp(min=MIN_WEIGHT) * SH_C0
     momentum = 1.0
     for _ in range(iterations):
         better = (ahead + pulled_back(ahead, None) / weights).clamp(least, most)

@@ -36,14 +36,14 @@ UNTOUCHED = 0.05
 """A Gaussian that every frame shows at least this near to free keeps its color."""
 UNSEEN = 0.1
 """Weight of a time at which no frame shows a Gaussian: its color then is a guess."""
-LEAST_FRAMES = 2.0
+MIN_FREE_FRAMES = 2.0
 """A Gaussian with fewer free frames, likelihoods added up, gets the color of those around it."""
 NEIGHBORS = 8
 ROUNDS, BRIGHTER = 4, 0.05
 """Rounds of weighting, and by how much a color must be brighter, of 1, to count half."""
 RIDGE = 0.05
 """Pulls the change over time to 0 where nothing is known: weight of a frame to each coefficient squared."""
-LARGEST_CHUNK = 2**24
+MAX_CHUNK = 2**24
 """Numbers of one array of what is solved at a time."""
 
 
@@ -73,13 +73,13 @@ def _refitted_scene(scene: SingleScene, frames: Iterable[Frame]) -> SingleScene:
     basis = torch.as_tensor(np.stack([spline_weights(t, changes.shape[1]) for t in times])).to(changes)
     weights = torch.as_tensor(np.where(np.isnan(free), UNSEEN, free)).to(changes)
     touched = np.nanmin(free, axis=1, initial=1) < 1 - UNTOUCHED
-    chunk = max(LARGEST_CHUNK // (max(basis.shape) * basis.shape[1]), 1)
+    chunk = max(MAX_CHUNK // (max(basis.shape) * basis.shape[1]), 1)
     for some in torch.from_numpy(np.flatnonzero(touched)).to(changes.device).split(chunk):
         sh_dc[some, 0], changes[some, :, part] = _refitted(
             sh_dc[some, 0], changes[some][:, :, part], basis, weights[some]
         )
     means = tensors["means"].detach().cpu().numpy()
-    known = np.asarray(np.nansum(free, axis=1) >= LEAST_FRAMES)
+    known = np.asarray(np.nansum(free, axis=1) >= MIN_FREE_FRAMES)
     never_seen = np.asarray(np.isnan(free).all(1))
     unseen = torch.from_numpy(never_seen).to(changes.device)
     for new, old in ((sh_dc, tensors["sh_dc"]), (changes[:, :, part], tensors["changes"][:, :, part])):

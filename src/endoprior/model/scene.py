@@ -30,7 +30,7 @@ from .offsets import Offsets
 from .ops import ops_for
 from .photometric import between, is_possible
 from .rendered_scene import RenderedScene, check_camera, no_gaussians
-from .scene_facts import MOST_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand, scene_facts
+from .scene_facts import MAX_STORED_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand, scene_facts
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ class SingleScene(Scene):
         """
         num, quats = len(arrays["gaussians.means"]), arrays["gaussians.quats"]
         demand(
-            ("gaussians", num <= MOST_GAUSSIANS, f"at most {MOST_GAUSSIANS:,} Gaussians"),
+            ("gaussians", num <= MAX_STORED_GAUSSIANS, f"at most {MAX_STORED_GAUSSIANS:,} Gaussians"),
             ("gaussians.quats", not num or bool((quats.abs().amax(1) >= 1e-12).all()), "no quaternion of length 0"),
             ("num_valid", bool((arrays["num_valid"] >= 0).all()), "counts"),
             ("smoke", "smoke" not in arrays or is_possible(arrays["smoke"]), "gains and veils"),

@@ -18,11 +18,11 @@ from .rendered_scene import RenderedScene
 
 SCENE_FORMAT = "endoprior-scene-1"
 """Name and version of the file format, in the file's metadata."""
-LARGEST_SIDE = 2**16
+MAX_SIDE = 2**16
 """Largest width or height of an image, px."""
-LARGEST_IMAGE = 2**26
+MAX_IMAGE = 2**26
 """Largest number of pixels of an image: 8192 x 8192."""
-MOST_GAUSSIANS = 10_000_000
+MAX_STORED_GAUSSIANS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class SceneFacts(Checked):
     """Metadata of a scene's file."""
 
     config: Config
-    width: Annotated[int, Range(1, LARGEST_SIDE)]
-    height: Annotated[int, Range(1, LARGEST_SIDE)]
+    width: Annotated[int, Range(1, MAX_SIDE)]
+    height: Annotated[int, Range(1, MAX_SIDE)]
     frames_per_second: Annotated[float, Range(1e-3, 1e6)]
     lengths_are_relative: bool = False
     trained_from: Annotated[float, Range(0, 1)] = 0.0
@@ -43,7 +43,7 @@ class SceneFacts(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("width times height", self.width * self.height, 1, LARGEST_IMAGE)
+        check_range("width times height", self.width * self.height, 1, MAX_IMAGE)
         check_range("trained_until", self.trained_until, self.trained_from, 1)
 
 

@@ -24,17 +24,17 @@ from . import windowed_scene
 from .method import config_from, method_of
 from .photometric import GRID
 from .scene import RenderedScene, SingleScene
-from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand
+from .scene_facts import MAX_IMAGE, MAX_SIDE, MAX_STORED_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand
 from .uncertainty import CELLS
 from .windowed_scene import Span, WindowedScene, window_file
 
-MOST_FRAMES = 1_000_000
+MAX_FRAMES = 1_000_000
 NEXT_STEP = "Train the scene again."
 CAMERAS = {
     "camera.intrinsics": ArraySpec("float64", ("T", 4)),
     "camera.world_to_camera": ArraySpec("float64", ("T", 4, 4)),
 }
-LARGEST_DEVIATION = 5e-3
+MAX_DEVIATION = 5e-3
 """Largest entry of R R^T - I that still passes for a rotation; readers accept 1e-3 of R^T R."""
 
 
@@ -101,8 +101,8 @@ def check_cameras(cameras: tuple[Camera, ...]) -> None:
     """
     first = cameras[0]
     demand(
-        ("width and height", max(first.width, first.height) <= LARGEST_SIDE, f"at most {LARGEST_SIDE:,} px"),
-        ("width times height", first.width * first.height <= LARGEST_IMAGE, f"at most {LARGEST_IMAGE:,} px"),
+        ("width and height", max(first.width, first.height) <= MAX_SIDE, f"at most {MAX_SIDE:,} px"),
+        ("width times height", first.width * first.height <= MAX_IMAGE, f"at most {MAX_IMAGE:,} px"),
     )
     _check_cameras(camera_arrays(cameras))
 
@@ -110,11 +110,11 @@ def check_cameras(cameras: tuple[Camera, ...]) -> None:
 def _check_cameras(arrays: Mapping[str, Tensor]) -> None:
     intrinsics, poses = (arrays[name].numpy() for name in CAMERAS)
     deviation = poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
-    rigid = (np.abs(deviation) <= LARGEST_DEVIATION).all((1, 2)) & (np.linalg.det(poses[:, :3, :3]) > 0)
+    rigid = (np.abs(deviation) <= MAX_DEVIATION).all((1, 2)) & (np.linalg.det(poses[:, :3, :3]) > 0)
     rigid &= (poses[:, 3] == (0, 0, 0, 1)).all(1) & (np.abs(poses[:, :3, 3]) <= FARTHEST_MM).all(1)
     focal = (intrinsics[:, :2] >= 1e-3) & (intrinsics[:, :2] <= 1e7)
     demand(
-        ("camera.intrinsics", 1 <= len(intrinsics) <= MOST_FRAMES, f"1 to {MOST_FRAMES:,} frames"),
+        ("camera.intrinsics", 1 <= len(intrinsics) <= MAX_FRAMES, f"1 to {MAX_FRAMES:,} frames"),
         ("camera.intrinsics", focal.all(), "focal lengths of 0.001 to 1e7 px"),
         ("camera.intrinsics", (np.abs(intrinsics[:, 2:]) <= 1e7).all(), "principal points within 1e7 px"),
         ("camera.world_to_camera", rigid.all(), f"rigid transforms within {FARTHEST_MM:g} mm"),
@@ -155,5 +155,5 @@ def _check_spans(spans: tuple[Span, ...], num_frames: int) -> None:
     demand(
         ("windows", bool(spans) and ends[1][0] == 0 and ends[-1][1] == num_frames, f"frames 0 to {num_frames}"),
         ("windows", ordered and apart and all(a < b for a, b in ends[1:]), "windows in order"),
-        ("windows", all(0 <= span.num_gaussians <= MOST_GAUSSIANS for span in spans), "counts of Gaussians"),
+        ("windows", all(0 <= span.num_gaussians <= MAX_STORED_GAUSSIANS for span in spans), "counts of Gaussians"),
     )

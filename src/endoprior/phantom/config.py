@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from ..core.checks import input_error, or_did_you_mean
 from .events import parse_events
 
-MOST_PIXELS = 3840 * 2160
+MAX_PIXELS = 3840 * 2160
 GB_PER_PIXEL = 1.3e-6
 """Memory for writing, measured at 1920x1080."""
 MOVING_SHARE = 4
@@ -26,7 +26,7 @@ Border = Literal["none", "octagon", "oval", "rounded"]
 
 NARROW_PULL_MM = 15.0
 """Up to this pull, mm, the moved neighborhood keeps its size; beyond, it grows in proportion, or tissue would fold."""
-MOST_MECHANICS_MM = 12.0
+MAX_MECHANICS_MM = 12.0
 """Largest pull of `mechanics`, mm: of 60 pulls (seeds 0 to 19) by 12 mm none folds the tissue, of 60 by 15 mm one."""
 
 
@@ -135,10 +135,10 @@ class PhantomConfig:
         if self.mechanics != "none":
             unused = ("breathing_mm",) if self.mechanics != "breathe" else ("pull_mm",)
             self._require_default(("slide_mm", *unused), f"--mechanics {self.mechanics}", "which it has no use for")
-            _require("pull_mm with --mechanics", self.pull_mm, 0, MOST_MECHANICS_MM)
+            _require("pull_mm with --mechanics", self.pull_mm, 0, MAX_MECHANICS_MM)
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
-        if self.width * self.height * share > MOST_PIXELS:
+        if self.width * self.height * share > MAX_PIXELS:
             needed = self.width * self.height * share * GB_PER_PIXEL
             got = f"{self.width}x{self.height}, which needs about {needed:.0f} GB"
             allowed = "at most 1920x1080 px in all with a moving camera" if moves else "at most 3840x2160 px in all"

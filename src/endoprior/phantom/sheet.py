@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 POISSON = 0.5
 _TOLERANCE = 1e-7
 """Largest force on a vertex in equilibrium, in units of the shear modulus times mm^2."""
-_MOST_STEPS = 60
+_MAX_STEPS = 60
 _HALVINGS = 12
 
 
@@ -88,7 +88,7 @@ class Sheet:
         energy = self.energy(moved, stiffness, target)
         if not np.isfinite(energy):
             raise NoEquilibrium("a triangle has no area at the start")
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             force = self.forces(moved, stiffness, target).ravel()[free]
             if np.abs(force).max(initial=0) < _TOLERANCE:
                 return moved
@@ -104,7 +104,7 @@ class Sheet:
                     break
             else:
                 raise NoEquilibrium("no step lowers the energy")
-        raise NoEquilibrium(f"not reached in {_MOST_STEPS} steps")
+        raise NoEquilibrium(f"not reached in {_MAX_STEPS} steps")
 
     def _descended(
         self, moved: NDArray, step: NDArray, slope: float, energy: float, stiffness: NDArray, target: NDArray

@@ -21,7 +21,7 @@ from ..prepare.scan import scan_video
 from ..prepare.segments import Stretch, as_json, best_segment, best_start, from_json, read_scan, segments_of
 
 SCAN = "scan.json"  # file in the output folder; the timeline lies beside it
-MOST_NAMED = 3  # other segments that are named
+MAX_NAMED = 3  # other segments that are named
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class SegmentChoice:
         lines = [f"segment {self.number} of {len(self.segments)} is used, {start:.1f}-{end:.1f} s: {why}"]
         whole = f"of {self.scanned['seconds']:.1f} s"
         lines.append(f"{whole}, in no segment: {bad}" if bad else f"{whole}; the rest are other scenes, or more of it")
-        for i in [each for each in ranked if each != self.number - 1][:MOST_NAMED]:
+        for i in [each for each in ranked if each != self.number - 1][:MAX_NAMED]:
             other, folder = self.segments[i], out.with_name(f"{out.name}_segment_{i + 1}")
             again = command_of("run", (video, folder), {**options, "--segment": (str(i + 1),)})
             lines.append(f"  {other.best[0]:.1f}-{other.best[1]:.1f} s, score {other.score:.1f}: `{again}`")

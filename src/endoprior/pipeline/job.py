@@ -29,15 +29,15 @@ from ..system.atomic import reject_occupied, write_json
 from ..system.file_lock import locked
 from .choice import SCAN, SegmentChoice, choose_segment
 
-LEAST_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed
-MOST_FRAMES = 10_000
+MIN_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed
+MAX_FRAMES = 10_000
 USUAL_FRAMES = 300  # a video with more frames loses some in between, as long as tissue can be followed
 PREVIEW_FRAMES = 60
 PREVIEW_WIDTH = 320  # width of the frames of a preview, px
 DATA = "data"  # folder in the output folder: the sequence that a video is prepared to
 SETTINGS = "settings.json"
 """File in the output folder with everything that decides the results: a job that is resumed must have the same."""
-MOST_NAMED = 4  # differences that a message names; more are counted
+MAX_NAMED = 4  # differences that a message names; more are counted
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def choose_part(
 ) -> Part:  # fmt: skip
     """The first part of a video that has at most `most` frames.
 
-    A long video loses frames in between, down to `LEAST_RATE`, until it has at most `usual`, then its end.
+    A long video loses frames in between, down to `MIN_RATE`, until it has at most `usual`, then its end.
 
     Args:
         times: when each image of the video is shown, s, ascending.
@@ -73,7 +73,7 @@ def choose_part(
 
     every = 1
     if not wanted_rate:
-        most_skipped, usual = max(math.floor(rate / LEAST_RATE), 1), usual or most
+        most_skipped, usual = max(math.floor(rate / MIN_RATE), 1), usual or most
         every = max(math.ceil(len(chosen(rate, most_skipped * usual)) / usual), 1)
     used = wanted_rate or rate / every
     frames = chosen(used, most + 1)
@@ -153,7 +153,7 @@ def make_job(
     """
     source = open_source(video, prepare.folder_rate)
     rate = source.frames_per_second
-    most, usual = (PREVIEW_FRAMES, PREVIEW_FRAMES) if preview else (MOST_FRAMES, USUAL_FRAMES)
+    most, usual = (PREVIEW_FRAMES, PREVIEW_FRAMES) if preview else (MAX_FRAMES, USUAL_FRAMES)
     choice = None
     if (prepare.start, prepare.end, prepare.stir) == (0, math.inf, None):
         choice = choose_segment(video, out, prepare.folder_rate, segment)
@@ -194,7 +194,7 @@ def open_folder(job: SequenceJob) -> bool:
     if not (found := differences(stored, given)):
         return True
     if any(path.exists() for path in (job.findings, job.run, job.out / DATA)):
-        got = "; ".join(found[:MOST_NAMED]) + (f"; and {len(found) - MOST_NAMED} more" if found[MOST_NAMED:] else "")
+        got = "; ".join(found[:MAX_NAMED]) + (f"; and {len(found) - MAX_NAMED} more" if found[MAX_NAMED:] else "")
         fix = "give the stored settings to resume, or choose another folder."
         raise input_error(job.out, "results of the same video and options", got, fix)
     with locked(job.out, work_lock(job.out / DATA)):  # else another process prepares it with the stored ones

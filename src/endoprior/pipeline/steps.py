@@ -68,12 +68,12 @@ class HandedOn:
 
 PICTURE_BYTES = 60  # memory in which a thread composes an image of the video, bytes for each px of a frame
 PLAYER_BYTES = 40_000_000  # largest player
-LEAST_BYTES = 7  # size of one Gaussian at one time step in the player; at least this (docs/export.md)
+MIN_BYTES = 7  # size of one Gaussian at one time step in the player; at least this (docs/export.md)
 TITLE_LETTERS = 150  # in a line above the report
 PREVIEW_TITLE = "Preview: small frames, short training. Not for scores."
 CODE = re.compile("[a-z]+(-[a-z]+)*")  # names of findings
 LOST_FRAMES = 5  # so many frames in a row without a pose: the camera is lost. Fewer are blurred or covered.
-FEWEST_FRAMES = 20  # fewer frames are not worth a scene
+MIN_SCENE_FRAMES = 20  # fewer frames are not worth a scene
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
 
 
@@ -287,7 +287,7 @@ def _player(job: SequenceJob, progress: Progress, _handed_on: HandedOn) -> list[
         every = every_kth_time(len(scene.cameras), most)
         return [time for time in every if time not in left_out] or every
 
-    times = shown(PLAYER_BYTES / (at_a_time * LEAST_BYTES))
+    times = shown(PLAYER_BYTES / (at_a_time * MIN_BYTES))
     title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video
     verdict = verdict_of(job)
     remark = " ".join([f"{verdict.plain}."] * bool(verdict.plain) + [f"Verdict: {verdict}"]) if verdict else ""
@@ -346,4 +346,4 @@ def usable_frames(num_frames: int, unexplained: list[int], cuts: list[int]) -> t
         if end - first >= LOST_FRAMES or first == 0 or end == num_frames:
             ends[first : end + 1] = True
     first, end = max(pairwise(np.flatnonzero(ends).tolist()), key=lambda part: part[1] - part[0])
-    return (first, end) if end - first >= FEWEST_FRAMES else (0, num_frames)
+    return (first, end) if end - first >= MIN_SCENE_FRAMES else (0, num_frames)

@@ -19,7 +19,7 @@ from ..footage.texts import confirm, follow, rectangle, text_mask
 from .notes import ToDo
 from .video_clip import StereoFrame
 
-MOST_NAMED = 5  # texts that notes name; more are counted
+MAX_NAMED = 5  # texts that notes name; more are counted
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ def find_text(
         for index, each in moved.items():
             boxes.setdefault(index, []).extend(each)
         notes.append(_note("text that moves", {index: each[0] for index, each in moved.items() if each}, indices, view))
-    more = [f"{len(notes) - MOST_NAMED} more texts"] if len(notes) > MOST_NAMED else []
+    more = [f"{len(notes) - MAX_NAMED} more texts"] if len(notes) > MAX_NAMED else []
     if notes:
         end = "It is masked, and black in the images. Look for text that was missed: `--blank X,Y,W,H` hides it"
-        notes = [ToDo(f"burnt-in text: {'; '.join(notes[:MOST_NAMED] + more)}. {end}")]
+        notes = [ToDo(f"burnt-in text: {'; '.join(notes[:MAX_NAMED] + more)}. {end}")]
     return BurntInText({index: each for index, each in boxes.items() if each}, notes)
 
 

@@ -22,9 +22,9 @@ from .calibration_tables import HINT, plain, read_table
 
 Unit = Literal["auto", "mm", "cm", "m"]
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-MOST_PX = 1e6  # largest plausible image size, focal length or principal point, px
+MAX_CALIBRATION_PX = 1e6  # largest plausible image size, focal length or principal point, px
 METERS_BELOW = 0.05  # A T shorter than this is in meters: no stereo endoscope has a baseline of 0.05 mm
-LEAST_SKEW = 1e-3  # share of the focal length above which the skew of K would move pixels: OpenCV ignores it
+MIN_SKEW = 1e-3  # share of the focal length above which the skew of K would move pixels: OpenCV ignores it
 
 MATRIX = (
     "k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix", "cameramat", "matrix",
@@ -171,10 +171,10 @@ def _camera(local: _Values, table: _Values, which: str) -> tuple[Intrinsics, boo
             raise local.error(want, f"no {missing[0]}", "Complete it.")
         fx, fy, cx, cy = map(local.number, (FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    plausible = np.abs(matrix).max() < MOST_PX and np.abs(distortion).max(initial=0) < MOST_PX
+    plausible = np.abs(matrix).max() < MAX_CALIBRATION_PX and np.abs(distortion).max(initial=0) < MAX_CALIBRATION_PX
     if not (plausible and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
         raise local.error("a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
-    if max(abs(matrix[0, 1]), abs(matrix[1, 0])) > LEAST_SKEW * matrix[0, 0]:
+    if max(abs(matrix[0, 1]), abs(matrix[1, 0])) > MIN_SKEW * matrix[0, 0]:
         raise local.error("a camera matrix without skew", str(matrix.tolist()), "Calibrate without skew.")
     # Files of this package count pixel centers from 0.5; OpenCV and all others count them from 0.
     ours = local.path.name == "sequence.json" or table.first(("flx", "leftflx"))
@@ -251,7 +251,7 @@ def _whole(part: _Values, found: tuple[Any, ...]) -> Size:
         width, height = (int(float(v)) for v in found)
     except (TypeError, ValueError, OverflowError):
         raise part.error("width and height in px", repr(found)[:60], "Correct them.") from None
-    if not (1 <= width < MOST_PX and 1 <= height < MOST_PX):
+    if not (1 <= width < MAX_CALIBRATION_PX and 1 <= height < MAX_CALIBRATION_PX):
         raise part.error("width and height in px", f"{width}x{height}", "Correct them.")
     return width, height
 

@@ -22,7 +22,7 @@ DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800  # FFmpeg's bits
 SHORT = 0.5  # a track that lasts a smaller share of the longest one is a preview
 RATES = (0.01, 100_000.0)  # plausible frame rates, 1/s
 USUAL_RATE = 25.0  # frame rate of a file without times, 1/s
-MOST_HELD = 16  # decoded images that are held in memory to spread them over time
+MAX_HELD = 16  # decoded images that are held in memory to spread them over time
 MATRIX_BYTES = 36  # of FFmpeg's display matrix, 3x3 integers of 32 bits
 NEAR = 0.25  # time steps that differ from the median by less than this share are the usual step
 SAME_RATE = 0.01  # a stated rate that differs from the measured one by less than this share is its exact value
@@ -81,10 +81,10 @@ class Timeline:
 def _of_one_time(
     images: Iterable[tuple[Item, float | None]],
 ) -> Iterator[tuple[list[Item], float | None, float | None]]:
-    """Images in a row with the same time, at most `MOST_HELD` together; that time, and the one after it."""
+    """Images in a row with the same time, at most `MAX_HELD` together; that time, and the one after it."""
     items, time = list[Item](), None
     for image, seconds in images:
-        if items and (time is None or seconds != time or len(items) == MOST_HELD):
+        if items and (time is None or seconds != time or len(items) == MAX_HELD):
             yield items, time, seconds
             items = []
         items.append(image)

@@ -22,10 +22,10 @@ from .calibration import Calibration, Intrinsics, Size, check_pair
 from .config import Rectangle
 
 MIN_SIDE_PX = 32
-LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0  # wrong coefficients give a focal length outside of these shares
-MOST_LOST = 0.2  # so much of an image may be lost: corners outside of a round image, where nothing was measured
+MIN_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.2, 5.0  # wrong coefficients give a focal length outside of these shares
+MAX_LOST = 0.2  # so much of an image may be lost: corners outside of a round image, where nothing was measured
 COMPARED = 8  # number of frames in which the offset between the rows of both cameras is measured ...
-FEWEST = 40  # ... and of matching features, over all of them, that it needs
+MIN_FEATURES = 40  # ... and of matching features, over all of them, that it needs
 Maps = tuple[NDArray, NDArray]
 Pair = tuple[Maps | None, Maps | None]
 Mask = NDArray[np.bool_]
@@ -185,7 +185,7 @@ def rectify(calibration: Calibration, size: Size, name: str, *, stereo: bool) ->
     matrix, turn, maps = _pair(calibration, size, name) if stereo else _single(calibration.left, size)
     share = matrix[0, 0] / calibration.left.matrix[0, 0]
     lost = max((_lost(each, size) for each in maps if each is not None), default=0.0)
-    if lost > MOST_LOST or not LEAST_FOCAL_SHARE < share < MOST_FOCAL_SHARE:
+    if lost > MAX_LOST or not MIN_FOCAL_SHARE < share < MAX_FOCAL_SHARE:
         got = f"{share:.3g} times the focal length and {lost:.0%} of the image lost after it"
         fix = "Check the distortion, its model and the size of its images."
         raise input_error(name, "a distortion that can be undone", got, fix)
@@ -290,8 +290,8 @@ def with_equal_rows(
         return np.concatenate([row_offsets_px(of.image(left), of.image(right, right=True)) for left, right in both])
 
     before = offsets(geometry)
-    if len(before) < FEWEST:
-        raise input_error("--row-offset", f"{FEWEST} features that both cameras see", str(len(before)), fix)
+    if len(before) < MIN_FEATURES:
+        raise input_error("--row-offset", f"{MIN_FEATURES} features that both cameras see", str(len(before)), fix)
     offset = float(np.median(before))
     moved = with_rows_moved(geometry, offset)
     left = float(np.median(np.abs(offsets(moved))))

@@ -19,7 +19,7 @@ exceeds that with one half upside down. Shading does not count: halves of a tube
 """
 HALF_SIZE, DETAIL_PX = (192, 128), 3.0  # (width, height) of compared halves, and the size of their details, px
 BLOCK, OFF_ROWS, OFF_COLUMNS = (28, 24), 5, 40  # (width, height) of a block, px, and how far away its match can lie
-LEAST_DETAIL = 1.0  # standard deviation of a block that shows something, levels
+MIN_DETAIL = 1.0  # standard deviation of a block that shows something, levels
 GLIMPSES = 9  # number of images that tell the stereo layout
 CONTENT = 3.0  # least standard deviation, levels, of a frame that shows something, in each of its rows and columns
 Image = NDArray[np.uint8]
@@ -120,7 +120,7 @@ def _correlation(first: NDArray, second: NDArray) -> float:
     for y in range(OFF_ROWS, HALF_SIZE[1] - height - OFF_ROWS + 1, height):
         for x in range(OFF_COLUMNS, HALF_SIZE[0] - width - OFF_COLUMNS + 1, width):
             block = first[y : y + height, x : x + width]
-            if block.std() > LEAST_DETAIL:
+            if block.std() > MIN_DETAIL:
                 near = second[y - OFF_ROWS :, x - OFF_COLUMNS :][: height + 2 * OFF_ROWS, : width + 2 * OFF_COLUMNS]
                 found.append(float(cv2.matchTemplate(near, block, cv2.TM_CCOEFF_NORMED).max()))
     return float(np.median(found)) if found else 0.0

@@ -26,10 +26,10 @@ COMPARED = 24  # number of frames that are compared with a later one
 SIDE_PX = 160
 # Largest forward-backward error of the flow, px, plus this share of the step ...
 MOTION_ROUND_TRIP_PX, MOTION_ROUND_TRIP_SHARE = 0.7, 0.1
-LEAST_AGREEING = 0.8  # ... on this share of the tissue. Where haze or darkness leaves less, nothing can be said.
+MIN_AGREEING = 0.8  # ... on this share of the tissue. Where haze or darkness leaves less, nothing can be said.
 # Least difference from the background motion, px, and as a multiple of that of the median pixel. At 1.5 and 5, frames
 # without tools are named in fetoscopy and colonoscopy.
-LEAST_PX, TIMES_MEDIAN = 2.0, 8.0
+MIN_MOTION_PX, TIMES_MEDIAN = 2.0, 8.0
 NEAR_TOOL_PX = 8  # motion this near to a mask is that of its tool, or of tissue that it pulls
 MIN_MOVING_REGION_SHARE = 0.01  # smaller regions, as a share of the view, are not reported
 SMOOTH_PX = 2.0
@@ -73,10 +73,10 @@ def moves_unmasked(first: Image, later: Image, view: Mask, tool: Mask) -> bool:
     view, tool = (cv2.resize(mask.astype(np.uint8), size, interpolation=how) > 0 for mask in (view, tool))
     forward, backward = flow_pair(before, after)
     background = (cv2.erode(view.astype(np.uint8), disk(3)) > 0) & ~tool
-    if not background.any() or _agree(forward, backward)[background].mean() < LEAST_AGREEING:
+    if not background.any() or _agree(forward, backward)[background].mean() < MIN_AGREEING:
         return False
     difference, usual = difference_from_background(forward, background)
-    most = max(TIMES_MEDIAN * usual, LEAST_PX)
+    most = max(TIMES_MEDIAN * usual, MIN_MOTION_PX)
     near = cv2.dilate(tool.astype(np.uint8), disk(NEAR_TOOL_PX)) > 0
     moving = (cv2.GaussianBlur(difference, (0, 0), SMOOTH_PX) > most) & view & ~near
     moving = np.asarray(cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, disk(3)), np.uint8)

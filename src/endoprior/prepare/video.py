@@ -24,7 +24,7 @@ from ..core.checks import input_error
 from ..core.shell import quoted
 from ..data.images import MIRRORED, TURNED, upright
 from ..data.pixels import is_matte
-from ..data.reading import MOST_PIXELS
+from ..data.reading import MAX_PIXELS
 from ..data.video_files import open_container, starts_of_parts, what_it_is
 from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, in_seconds, is_cover, packet_times, usual_rate
 from .notes import ToDo
@@ -84,7 +84,7 @@ class Video:
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
         first = next(iter(self), None)
         if first is None:
-            want = f"a video with images of at most {MOST_PIXELS // 1_000_000} Mpx"
+            want = f"a video with images of at most {MAX_PIXELS // 1_000_000} Mpx"
             raise input_error(path, want, "none that can be decoded", COPY_AGAIN)
         self.height, self.width = first.rgb_u8.shape[:2]
         lasts = max(self._announced_end - self.start, 0.0)
@@ -260,7 +260,7 @@ class Video:
                 raise input_error(self.path, "a video", got, "Check the path, or export it as H.264.")
             demand_size(self.path, track.codec_context.width, track.codec_context.height)
             # The size may change later, and that which the container states may be wrong.
-            track.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
+            track.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
             yield container, track
 
 
@@ -284,8 +284,8 @@ def _small(image: DecodedImage, width: int, height: int, is_gray: bool = False) 
 
 def demand_size(path: Path, width: int, height: int) -> None:
     """Raise InputError if the images of a video are too large."""
-    if width * height > MOST_PIXELS:
-        want = f"images of at most {MOST_PIXELS // 1_000_000} Mpx"
+    if width * height > MAX_PIXELS:
+        want = f"images of at most {MAX_PIXELS // 1_000_000} Mpx"
         raise input_error(path, want, f"{width}x{height}", "Export the video at a smaller size.")
 
 

@@ -48,11 +48,11 @@ TILE = 16
 """Side of gsplat's tiles, px."""
 NEAR_PLANE = float(np.nextafter(np.float32(NEAR_Z), np.float32(1)))
 """gsplat culls z < this."""
-LARGEST = 1e18
+MAX_MAGNITUDE = 1e18
 """A mean, quaternion, scale or opacity beyond it is culled: its square would leave float32."""
-LARGEST_SH = OVERFLOW / 64
+MAX_SH = OVERFLOW / 64
 """An SH coefficient beyond it is culled: the sum of 16 of them could leave float32."""
-LARGEST_SIGMA = 1e9
+MAX_SIGMA = 1e9
 """px. The determinant of a wider footprint would leave float32."""
 KEPT_CAMERAS = 1024
 """Cameras whose numbers stay on the device."""
@@ -71,7 +71,7 @@ class CameraTensors(NamedTuple):
     last_pixel: Tensor
     """(B, 1, 2) center of the last pixel, px."""
     widest: Tensor
-    """(B, 1) of a Gaussian, standard deviation / z at which its footprint could be LARGEST_SIGMA wide."""
+    """(B, 1) of a Gaussian, standard deviation / z at which its footprint could be MAX_SIGMA wide."""
 
     def depths(self, points: Tensor) -> Tensor:
         """(B, N) camera-space z of (B, N, 3) points, mm."""
@@ -174,7 +174,7 @@ def camera_tensors(camera: Camera, device: torch.device) -> CameraTensors:
     steepest = max(fx * np.hypot(1, slope_x), fy * np.hypot(1, slope_y))
     away = 1 + 1e-3 * np.linalg.norm(camera.center)  # mm; more than float32 rounds off
     intrinsics = (fx, 0, cx, 0, fy, cy, 0, 0, 1)
-    ends = (camera.width - 0.5, camera.height - 0.5, LARGEST_SIGMA / steepest)
+    ends = (camera.width - 0.5, camera.height - 0.5, MAX_SIGMA / steepest)
     numbers = np.concatenate([view.ravel(), intrinsics, camera.center, camera.center - away * view[2, :3], ends])
     return _on_device(numbers.astype(np.float32).tobytes(), device)
 
@@ -220,9 +220,9 @@ def _usable(splats: Splats, tensors: CameraTensors) -> Tensor:
     numbers = torch.cat([splats.means, splats.quats, splats.scales, splats.opacities[..., None]], -1)
     slopes = color_slopes(splats)
     return (
-        (numbers.abs() < LARGEST).all(-1)
-        & (splats.sh.abs() < LARGEST_SH).flatten(2).all(-1)
-        & (slopes.abs() < LARGEST_SH).flatten(2).all(-1)
+        (numbers.abs() < MAX_MAGNITUDE).all(-1)
+        & (splats.sh.abs() < MAX_SH).flatten(2).all(-1)
+        & (slopes.abs() < MAX_SH).flatten(2).all(-1)
         & (splats.quats.norm(dim=-1) >= MIN_QUAT)
         & (splats.scales.amax(-1) < tensors.widest * tensors.depths(splats.means))
     )

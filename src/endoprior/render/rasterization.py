@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..core.checks import input_error, or_did_you_mean
-from ..core.types import LEAST_ALPHA, Camera, Splats
+from ..core.types import MIN_ALPHA, Camera, Splats
 from . import load, sh
 from .arguments import check_arguments
 from .autograd import Composite, Project, Tensors
@@ -304,7 +304,7 @@ def _composite(
 def _image(color: Tensor, alpha: Tensor, depth: Tensor, render_mode: RenderMode) -> Tensor:
     """(H, W, X) what a mode asks for."""
     if render_mode.endswith("ED"):
-        depth = depth / alpha.clamp(min=LEAST_ALPHA)
+        depth = depth / alpha.clamp(min=MIN_ALPHA)
     if render_mode == "RGB":
         return color
     return torch.cat([color, depth[..., None]], -1) if "+" in render_mode else depth[..., None]

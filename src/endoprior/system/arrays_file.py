@@ -27,7 +27,7 @@ KEY = "endoprior"
 """The single metadata entry. With several, safetensors writes them in random order, and equal files would differ."""
 DIGEST = "digest"
 """The entry of the metadata with the digest of all others and of the arrays. Earlier versions wrote none."""
-LARGEST_HEADER, LARGEST_FILE = 2**20, 2**36
+MAX_HEADER, MAX_FILE = 2**20, 2**36
 """bytes. Normal headers (names, shapes, metadata) have a few thousand; a sparse file could claim any size."""
 DTYPES = {"float32": "F32", "float64": "F64", "int64": "I64", "uint8": "U8"}
 """Names of the types in the file."""
@@ -153,7 +153,7 @@ def _check_size(path: Path) -> None:
         raise InputError("expected a plain file, got a folder, a pipe or a device")
     with open(path, "rb") as file:
         header = int.from_bytes(file.read(8), "little")
-    for name, size, largest in (("header", header, LARGEST_HEADER), ("file", facts.st_size, LARGEST_FILE)):
+    for name, size, largest in (("header", header, MAX_HEADER), ("file", facts.st_size, MAX_FILE)):
         if size > largest:
             raise InputError(f"expected a {name} of at most {largest:,} bytes, got {size:,}")
 

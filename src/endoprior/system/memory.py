@@ -15,10 +15,10 @@ from typing import Generic, TypeVar
 from ..core.checks import input_error
 
 CACHE_SHARE = 0.1
-LEAST_CACHE, LARGEST_CACHE = 256 * 2**20, 512 * 2**20
+MIN_CACHE, MAX_CACHE = 256 * 2**20, 512 * 2**20
 """Size of each frame cache: a share of the free memory at its creation, but at least and at most so many bytes. So a
 window of a long sequence fits, and memory does not grow."""
-LEAST_DATA, LEAST_SPACE = 600 * 2**20, 1500 * 2**20
+MIN_DATA, MIN_SPACE = 600 * 2**20, 1500 * 2**20
 """Writable memory and address space that the libraries alone need, bytes (docs/reliability.md)."""
 VARIABLE = "ENDOPRIOR_CACHE_GB"
 """Environment variable that overrides the size of each cache, GB."""
@@ -47,7 +47,7 @@ def cache_bytes() -> int:
     try:
         return max(int(float(os.environ[VARIABLE]) * 1e9), 0)
     except (KeyError, ValueError, OverflowError):
-        return min(max(int(CACHE_SHARE * (available_bytes() or 0)), LEAST_CACHE), LARGEST_CACHE)
+        return min(max(int(CACHE_SHARE * (available_bytes() or 0)), MIN_CACHE), MAX_CACHE)
 
 
 def reject_small_limits() -> None:
@@ -56,7 +56,7 @@ def reject_small_limits() -> None:
         import resource
     except ImportError:  # the system has no such limits
         return
-    for kind, option, least in ((resource.RLIMIT_DATA, "-d", LEAST_DATA), (resource.RLIMIT_AS, "-v", LEAST_SPACE)):
+    for kind, option, least in ((resource.RLIMIT_DATA, "-d", MIN_DATA), (resource.RLIMIT_AS, "-v", MIN_SPACE)):
         limit = resource.getrlimit(kind)[0]
         if limit != resource.RLIM_INFINITY and limit < least:
             want, got = f"at least {least >> 20} MB to load the libraries", f"{limit >> 20} MB"

@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from ..core.checks import input_error
 
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 """Numba crashes with very many."""
 THREADING_LAYERS = ("default", "safe", "forksafe", "threadsafe", "tbb", "omp", "workqueue")
 
@@ -32,7 +32,7 @@ def set_up_process() -> None:
     # Idle torch threads spin on the cores that Numba needs, which makes rendering three times slower (docs/log.md).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ["MPLBACKEND"] = "agg"  # figures are files; Matplotlib fails to import with one that it does not know
-    # How many pixels OpenCV decodes at most (`data.reading.MOST_PIXELS`): what a header says twice, its decoders and
+    # How many pixels OpenCV decodes at most (`data.reading.MAX_PIXELS`): what a header says twice, its decoders and
     # the readers of headers may understand differently.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "64000000")
     warnings.filterwarnings("ignore", module=r"PIL\.\w+Plugin")  # of damaged tags, which are read as missing
@@ -50,8 +50,8 @@ def reject_surroundings() -> None:
         fix = "`export HOME=FOLDER`, one that is yours alone."
         raise input_error("HOME", "an absolute path, for caches", "none" if home == "~" else repr(home), fix)
     threads = os.environ.get("NUMBA_NUM_THREADS", "1")
-    if not (threads.isascii() and threads.isdigit() and 1 <= int(threads) <= MOST_THREADS):
-        what = f"a number of threads, 1 to {MOST_THREADS}"
+    if not (threads.isascii() and threads.isdigit() and 1 <= int(threads) <= MAX_THREADS):
+        what = f"a number of threads, 1 to {MAX_THREADS}"
         raise input_error("NUMBA_NUM_THREADS", what, repr(threads), "`unset NUMBA_NUM_THREADS`.")
     layer = os.environ.get("NUMBA_THREADING_LAYER", "default")
     if layer not in THREADING_LAYERS:

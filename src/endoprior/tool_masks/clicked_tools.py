@@ -28,11 +28,11 @@ from ..footage.optical_flow import MIN_SIZE_PX, flow_pair, gray_for_flow
 from .examples import Examples, clicked_region, examples_of, feature_map, fit
 from .mask_store import SAMPLES, view_of
 from .network import ToolFinder, full_size, network_image, small_view
-from .over_time import MOST_LOG_ODDS
+from .over_time import MAX_LOG_ODDS
 from .regions import tool_regions
 
 TAUGHT = 12  # Number of frames, besides the clicked ones, from which examples are taken
-LEAST_PART_PX = 30
+MIN_PART_PX = 30
 """Smaller parts are left out: pieces of the rims of known tools, which would change the masks of all frames."""
 
 
@@ -124,9 +124,9 @@ def _steps(
     for i in range(count):
         features, known = look(i)
         # Known tools count as certain, so that a part which touches one enters the view with it.
-        odds = np.clip(classifier.log_odds(features), -MOST_LOG_ODDS, MOST_LOG_ODDS)
-        found = np.where(known, MOST_LOG_ODDS, odds).astype(np.float32)
-        parts = large_regions(tool_regions(found, small) & ~known, LEAST_PART_PX) | regions.get(i, False)
+        odds = np.clip(classifier.log_odds(features), -MAX_LOG_ODDS, MAX_LOG_ODDS)
+        found = np.where(known, MAX_LOG_ODDS, odds).astype(np.float32)
+        parts = large_regions(tool_regions(found, small) & ~known, MIN_PART_PX) | regions.get(i, False)
         yield SearchStep(len(taught) + i + 1, total, i, full_size(parts, view.shape) & view & ~tool(i))
 
 

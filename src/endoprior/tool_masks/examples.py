@@ -24,11 +24,11 @@ from ..footage.components import Mask, components, dilated, disk
 SURE = 4.0  # Log-odds count up to this, so that examples can outweigh a network that is sure and wrong
 COLORS = 5  # Channels of the network's image: color, two color ratios
 SMOOTH_PX, CONTRAST_PX = 1.0, 2.0  # Standard deviations of the windows of color and contrast
-LEAST_CONTRAST = 0.02  # Added before the logarithm: about the noise of a color of [-1, 1]
+MIN_CONTRAST = 0.02  # Added before the logarithm: about the noise of a color of [-1, 1]
 LOOK = slice(0, 1 + COLORS)
 """The features by which a region of one tool is told from what is beside it: all but the contrast."""
-LARGEST_REGION = 0.08  # Largest region of one click, as a share of the view: larger ones have run over tissue
-LEAST_REGION_PX = 20  # Smaller regions are not compared: their outlines are rough
+MAX_REGION = 0.08  # Largest region of one click, as a share of the view: larger ones have run over tissue
+MIN_REGION_PX = 20  # Smaller regions are not compared: their outlines are rough
 FARTHEST, NUM_THRESHOLDS = 2.5, 60
 """Largest difference from the click, in standard deviations of the frame, and number of differences that are tried."""
 STEPS_BESIDE = 3  # A region is stable if it grows little from so many thresholds below to so many above
@@ -42,8 +42,8 @@ to take tissue for a tool is worse than to miss a part, which another click find
 LOOKS_CLICKED = 0.7  # Tissue of a higher probability is no example: it is likely the clicked tool in another frame
 ROUNDS = 2
 RIDGE = 1.0
-MOST_STEPS = 20
-SMALLEST_STEP = 1e-3  # A Newton step is halved until the loss falls; below this share of it the fit is done
+MAX_STEPS = 20
+MIN_STEP = 1e-3  # A Newton step is halved until the loss falls; below this share of it the fit is done
 SMALL_GAIN = 1e-3  # The fit is done when a step lowers the loss by less
 
 
@@ -74,7 +74,7 @@ def feature_map(log_odds: NDArray[np.float32], image: NDArray[np.float32]) -> ND
     """(h, w, 7) clipped log-odds, smoothed color, log of the local contrast, of log-odds and `network_input`."""
     gray = image[:3].mean(0)
     mean, square = (cv2.GaussianBlur(each, (0, 0), CONTRAST_PX) for each in (gray, gray * gray))
-    contrast = np.log(np.sqrt(np.maximum(square - mean * mean, 0)) + np.float32(LEAST_CONTRAST))
+    contrast = np.log(np.sqrt(np.maximum(square - mean * mean, 0)) + np.float32(MIN_CONTRAST))
     color = [cv2.GaussianBlur(channel, (0, 0), SMOOTH_PX) for channel in image[:COLORS]]
     return np.stack([np.clip(log_odds, -SURE, SURE), *color, contrast], -1).astype(np.float32)
 
@@ -95,7 +95,7 @@ def clicked_region(features: NDArray[np.float32], free: Mask, spot: tuple[int, i
     for most in np.linspace(difference[y, x] + 0.02, FARTHEST, NUM_THRESHOLDS):
         labels, _ = components(((difference <= most) & free) | seed, 4)
         region = labels == labels[y, x]
-        if region.sum() > LARGEST_REGION * free.sum():
+        if region.sum() > MAX_REGION * free.sum():
             break
         regions.append(region)
     return regions[_most_stable(np.array([region.sum() for region in regions]))] if regions else seed
@@ -106,7 +106,7 @@ def _most_stable(areas: NDArray) -> int:
     above, below = np.minimum(at + STEPS_BESIDE, len(areas) - 1), np.maximum(at - STEPS_BESIDE, 0)
     log = np.log(areas)
     growth = (log[above] - log[below]) / np.maximum(above - below, 1) - LARGER_IS_BETTER * log
-    large = areas >= LEAST_REGION_PX
+    large = areas >= MIN_REGION_PX
     return int(np.where(large, growth, np.inf).argmin()) if large.any() else len(areas) - 1
 
 
@@ -160,14 +160,14 @@ def fit_logistic(
         return float(weight @ np.logaddexp(0, -sign * (offset + x @ at)) + penalty @ at**2 / 2)
 
     now = loss(found)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         p = probability(offset + x @ found)
         gradient = x.T @ (weight * (p - is_tool)) + penalty * found
         curvature = (x * (weight * p * (1 - p))[:, None]).T @ x + np.diag(penalty)
         step, share = np.linalg.solve(curvature, gradient), 1.0
         while (then := loss(found - share * step)) > now:
             share /= 2
-            if share < SMALLEST_STEP:
+            if share < MIN_STEP:
                 return found
         found, gain, now = found - share * step, now - then, then
         if gain < SMALL_GAIN:

@@ -183,7 +183,7 @@ def weights_of(network: ToolNetwork) -> bytes:
 
 
 MAYBE = 0.25  # Pixels of a higher probability may be a tool: they count in the confidence
-LEAST_DOUBT = 0.004  # Share of the view in doubt from which on a frame without a mask is uncertain
+MIN_DOUBT = 0.004  # Share of the view in doubt from which on a frame without a mask is uncertain
 
 
 class ToolFinder:
@@ -237,7 +237,7 @@ def _confidence(mask: Mask, log_odds: NDArray[np.float32], view: Mask) -> float:
     """That of `FoundTools`, from (h, w) arrays."""
     probability = 1 / (1 + np.exp(-log_odds))
     maybe = probability[(mask | (probability > MAYBE)) & view]
-    enough = mask.any() or maybe.size > LEAST_DOUBT * view.sum()
+    enough = mask.any() or maybe.size > MIN_DOUBT * view.sum()
     return float(np.abs(2 * maybe - 1).mean()) if enough else 1.0
 
 

@@ -21,13 +21,13 @@ from ..footage.optical_flow import MIN_SIZE_PX, flow_pair
 from .regions import candidate_regions, joined
 
 KEEP = 0.85  # Weight of the frame before: half a second of video at 25 frames/s
-MOST_LOG_ODDS = 6.0  # One sure frame does not outweigh all others
+MAX_LOG_ODDS = 6.0  # One sure frame does not outweigh all others
 COLOR_SCALE_LEVELS, ROUND_TRIP_SCALE_PX = 15.0, 1.5
 """Differences of color, of 255, and of flow there and back, px, at which a place counts e times less."""
 COLOR_BLUR_PX = 1.0
 CHUNK, MARGIN = 120, 24  # Frames that are decided at once, and that are known beside them: KEEP^24 is 2 %
 AGREED = 0.5  # Share of the frames around that take a region for a tool
-LEAST_TRUST = 0.2  # Of that: a region that the network outlines in this frame too is hardly another thing
+MIN_TRUST = 0.2  # Of that: a region that the network outlines in this frame too is hardly another thing
 Values = NDArray[np.float32]
 
 
@@ -62,10 +62,10 @@ def decide_over_time(looks: Iterable[Look], view: Mask) -> Iterator[SmallTools]:
 
 def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
     links = [BidirectionalFlow.between(before, after) for before, after in pairwise(looks)]
-    odds = carried([np.clip(look.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS) for look in looks], links)
+    odds = carried([np.clip(look.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS) for look in looks], links)
     regions = [candidate_regions(each, view) for each in odds]
     taken = [np.any([np.zeros_like(view), *(r.mask for r in found if r.is_tool)], axis=0) for found in regions]
-    agreed = carried([mask.astype(np.float32) for mask in taken], links, LEAST_TRUST)
+    agreed = carried([mask.astype(np.float32) for mask in taken], links, MIN_TRUST)
     return [
         SmallTools(joined([r.mask for r in found if share[r.mask].mean() > AGREED], each, view), each)
         for found, share, each in zip(regions, agreed, odds, strict=True)

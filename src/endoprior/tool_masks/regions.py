@@ -24,7 +24,7 @@ REACH = 0.75
 """A tool enters end first: it must reach into the view by this share of the length of its contact with the border.
 At 0.5 an organ along the border passes; at 1 a thick shaft that has just entered fails."""
 MIN_TOOL_REGION_SHARE = 0.002  # Smaller regions, as a share of the view, are removed: about 25 px square at 640x512
-LARGEST_HOLE = 0.01  # Holes up to this share of the view are filled: highlights, and the windows of a grasper's jaws
+MAX_HOLE = 0.01  # Holes up to this share of the view are filled: highlights, and the windows of a grasper's jaws
 RIM_PX = 2  # Pixels this near to a tool belong to it from the first level on
 OUTSIDE = -8.0  # Log-odds beyond the view
 
@@ -45,7 +45,7 @@ def tool_regions(log_odds: NDArray[np.float32], view: Mask) -> Mask:
 
 def candidate_regions(log_odds: NDArray[np.float32], view: Mask) -> list[Region]:
     """All regions with an outline; arguments as in `tool_regions`. In one that is no tool, smaller ones may be."""
-    smooth, least, most = _smooth(log_odds, view), MIN_TOOL_REGION_SHARE * view.sum(), LARGEST_HOLE * view.sum()
+    smooth, least, most = _smooth(log_odds, view), MIN_TOOL_REGION_SHARE * view.sum(), MAX_HOLE * view.sum()
     probability = 1 / (1 + np.exp(-smooth))
 
     def regions(mask: Mask, level: int) -> list[Region]:
@@ -76,7 +76,7 @@ def joined(masks: list[Mask], log_odds: NDArray[np.float32], view: Mask) -> Mask
     """(h, w) the union of regions, with their rims."""
     union = np.any([np.zeros_like(view), *masks], axis=0)
     rim = (_smooth(log_odds, view) > LEVELS[0]) & dilated(union, disk(RIM_PX))
-    return filled(union | rim, LARGEST_HOLE * view.sum()) & view
+    return filled(union | rim, MAX_HOLE * view.sum()) & view
 
 
 def _smooth(log_odds: NDArray[np.float32], view: Mask) -> NDArray[np.float32]:

@@ -31,7 +31,7 @@ STRETCH = 50
 RIM_SHARE = 1 / 320
 """Width of the rim that found tools have around them, as a share of the image width: 2 px of 640."""
 MIN_PROMPT_REGION_SHARE = 0.002  # Smaller regions, as a share of the image, prompt nothing
-MOST_REGIONS = 6  # Of one frame, the largest first. Each is an object of its own, which takes memory and time
+MAX_REGIONS = 6  # Of one frame, the largest first. Each is an object of its own, which takes memory and time
 COVERED = 0.1  # A region with at least this share inside masks that were carried before is not new
 
 
@@ -179,7 +179,7 @@ def rim_px(width: int) -> int:
 
 
 def sure_regions(tool_mask: Mask, covered: Mask | None = None) -> list[Mask]:
-    """The connected regions of a tool mask (H, W) without its rim, the largest first, at most `MOST_REGIONS`; without
+    """The connected regions of a tool mask (H, W) without its rim, the largest first, at most `MAX_REGIONS`; without
     those that lie in `covered`, tools that are known already.
     """
     # The image's edge is not an edge of the tool: nothing is taken off there.
@@ -189,7 +189,7 @@ def sure_regions(tool_mask: Mask, covered: Mask | None = None) -> list[Mask]:
     large = [labels == i for i in order if areas[i] >= MIN_PROMPT_REGION_SHARE * tool_mask.size]
     if covered is not None:
         large = [region for region in large if covered[region].mean() < COVERED]
-    return large[:MOST_REGIONS]
+    return large[:MAX_REGIONS]
 
 
 def with_rim(tool_mask: Mask) -> Mask:

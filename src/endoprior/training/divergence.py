@@ -2,7 +2,7 @@
 
 Each iteration is checked after its gradients are known and before anything changes. That suffices: Adam moves a
 parameter by at most 0.1 / sqrt(0.001) / sqrt(1 - 0.81 / 0.999) = 7.3 times its learning rate (Cauchy-Schwarz), rates
-are bounded (`OptimConfig`), and gradients below `LARGEST_GRADIENT` have squares that float32 can hold, so that moments
+are bounded (`OptimConfig`), and gradients below `MAX_GRADIENT` have squares that float32 can hold, so that moments
 and parameters stay finite.
 
 On the CPU the result is known at once. On a device the host would have to wait for it, so it reads the results only
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ..core.checks import InputError
 
-LARGEST_GRADIENT = 1e15  # beyond this, or without a value, a gradient means that the run has diverged
+MAX_GRADIENT = 1e15  # beyond this, or without a value, a gradient means that the run has diverged
 CHECK_EVERY = 20  # iterations between two checks on a device: each check makes the host wait once
 WINDOW = 300  # iterations over which images that are no better than empty ones count as divergence
 PARTS = 10
@@ -86,7 +86,7 @@ class DivergenceCheck:
 
         Args:
             terms: weighted terms of the loss, () each.
-            unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
+            unusable: entries of each gradient that are not finite or beyond `MAX_GRADIENT`, by name.
             color_error: (); empty_error: see `Watch.see`.
             wait: read the results now: what follows cannot be undone.
         Raises:

@@ -42,7 +42,7 @@ SURELY_TISSUE = -3.0  # log-odds of a tool below which a pixel always counts
 SAMPLES = 12  # frames from which the border of the view is taken
 VISITS = 4  # number of visits that are kept of each frame: early ones show what the scene had not learned yet
 MIN_MISSED_TOOL_SHARE = 0.005  # share of the view from which on a visit speaks for one: about 40 px square at 640x512
-LEAST_VISITS = 2  # so many of the last visits must; a single one may be a highlight
+MIN_VISITS = 2  # so many of the last visits must; a single one may be a highlight
 
 
 def missed_tools(
@@ -135,5 +135,5 @@ def record_visit(shares: Tensor, position: int, share: float) -> None:
 
 def missed_tool_frames(shares: Tensor, indices: Sequence[int]) -> tuple[int, ...]:
     """Those of the training frames `indices` whose masks likely miss a tool, by their `shares` (F, VISITS)."""
-    often = (shares > MIN_MISSED_TOOL_SHARE).sum(1) >= LEAST_VISITS
+    often = (shares > MIN_MISSED_TOOL_SHARE).sum(1) >= MIN_VISITS
     return tuple(index for index, missed in zip(indices, often.tolist(), strict=True) if missed)

@@ -17,7 +17,7 @@ from ..model.motion import Field
 from ..model.offsets import RankOneGradient, UnstoredGradient
 from ..system.arrays_file import part
 from .adam import AdamState, PlaneAdam, adam_unstored_step
-from .divergence import LARGEST_GRADIENT
+from .divergence import MAX_GRADIENT
 from .ops_interface import TrainingOps
 
 Rate = Callable[[int], float]  # learning rate at an iteration (1-based, within the stage)
@@ -133,9 +133,9 @@ class Optimizer:
         """How many entries of each gradient are not finite or too large to be squared, by name."""
         found = {name: param.grad for name, param in self._dense().items() if param.grad is not None}
         found |= {f"motion, time step {i}": g.v_offsets for i, g in enumerate(self.gaussians.motion_gradients)}
-        counts = {name: self._ops.count_unusable(grad, LARGEST_GRADIENT) for name, grad in found.items()}
+        counts = {name: self._ops.count_unusable(grad, MAX_GRADIENT) for name, grad in found.items()}
         if self.planes:
-            counts["planes"] = self._ops.count_unusable_in_planes(self.planes.grid, LARGEST_GRADIENT)
+            counts["planes"] = self._ops.count_unusable_in_planes(self.planes.grid, MAX_GRADIENT)
         return counts
 
     def drop_gradients(self) -> None:

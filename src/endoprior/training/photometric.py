@@ -28,7 +28,7 @@ HELD_GAIN, HELD_VEIL = 0.1 * SQUARE, 1.0 * SQUARE
 """How strongly coefficients are held to those of the frame before, and then of a wider neighborhood, as shares of the
 pixels of a cell."""
 COARSE, FINE = 3.0, 0.7  # standard deviation of the neighborhood in which a coefficient is fitted, cells
-LEAST_GAIN, MOST_GAIN = 0.02, 16.0
+MIN_GAIN, MAX_GAIN = 0.02, 16.0
 FOLLOW = 0.15  # share by which a frame changes the running mean of the tissue
 BRIGHT = 0.95  # color from which a pixel does not count: the sensor is saturated
 CLEAR = 0.01  # mean veil up to which a frame counts as clear, about: the gains of clear frames average to 1
@@ -158,7 +158,7 @@ def fitted(tissue: NDArray, target: NDArray, weight: NDArray, held: NDArray) -> 
         determinant = np.maximum(a * c - b * b, 1e-12)
         gain, veil = (c * p - b * q) / determinant, (a * q - b * p) / determinant
         gain = np.where(veil < 0, p / a, gain)  # smoke adds light
-        found = np.stack([np.clip(gain, LEAST_GAIN, MOST_GAIN), np.maximum(veil, 0)], -1)
+        found = np.stack([np.clip(gain, MIN_GAIN, MAX_GAIN), np.maximum(veil, 0)], -1)
     return np.asarray(found, np.float32)
 
 

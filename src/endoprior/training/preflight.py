@@ -53,7 +53,7 @@ def note_on_budget(cfg: Config) -> str | None:
 
 FLOAT = 4
 PICTURE_BYTES = 150  # per pixel: a decoded frame, its prior, a rendered image and its gradients
-LEAST_BYTES = 300 * 2**20  # compiled kernels, lists of the renderer, buffers of the libraries
+MIN_BYTES = 300 * 2**20  # compiled kernels, lists of the renderer, buffers of the libraries
 MOMENTS = 2  # Adam keeps two numbers of each parameter
 TRACK_BYTES = 64  # per point and frame while motion is fitted: pixel, position and offset in float64
 
@@ -91,7 +91,7 @@ def least_bytes(cfg: Config, num: int, num_train: int, width: int, height: int) 
     # Growing and pruning copy a tensor twice; tracks are there before the moments are.
     growing, motion = 2 * max(gaussians, default=0), sizes.get("gaussians.motion", 0)
     tracks = TRACK_BYTES * num_train * num + motion if cfg.init.motion == "flow" and motion else 0
-    return LEAST_BYTES + PICTURE_BYTES * width * height + max(state + growing, tracks)
+    return MIN_BYTES + PICTURE_BYTES * width * height + max(state + growing, tracks)
 
 
 def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:

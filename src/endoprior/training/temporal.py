@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 DISPLACEMENT_WEIGHT, DISTANCE_WEIGHT = 1.0, 0.2  # lambda_disp and lambda_dist
 MOTION_THRESHOLD, MOTION_TEMPERATURE = 0.45, 0.08  # tau_m and gamma_m of Eq. (9)
-MOST_POINTS = 1024  # Gaussians that are sampled by weight for an iteration that trains one time
+MAX_SAMPLED_GAUSSIANS = 1024  # Gaussians that are sampled by weight for an iteration that trains one time
 MIN_EFFECTIVE = 256  # effective sample size that the released code relaxes the weights for
 MIN_WEIGHT = 1e-4  # motion weights up to this are treated as zero (released code)
 EVALUATIONS, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
@@ -94,7 +94,7 @@ def choose(
     candidates = np.flatnonzero(eligible)
     score = score[candidates]
     weights = np.ones_like(score) if cfg.without == "pair_weights" else kept_motion_weight(score, released)
-    chosen = systematic_sample(weights, len(weights) if cfg.gradient == "both" else MOST_POINTS, released)
+    chosen = systematic_sample(weights, len(weights) if cfg.gradient == "both" else MAX_SAMPLED_GAUSSIANS, released)
     if len(chosen) < least_points(cfg):
         chosen = chosen[:0]
     return candidates[chosen], weights[chosen]

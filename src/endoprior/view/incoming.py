@@ -18,7 +18,7 @@ MAX_WAITING = 200
 """Largest number of waiting jobs; a person never reaches it."""
 BRUSH_NODE = "/brush"
 """The only object of the scene that browsers can drag: see `mask_editor`."""
-LARGEST_CANVAS = 100_000
+MAX_CANVAS = 100_000
 """Largest side of a canvas, px."""
 Job = Callable[[], object]
 Accepts = Callable[[str, Any], bool]
@@ -84,9 +84,7 @@ FIELDS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("position", "look_at", "up_direction"), _is_place),
     **dict.fromkeys(("ray_origin", "ray_direction", "start_position", "end_position"), _is_place),
     "fov": lambda value: are_numbers([value], 1, 4),
-    **dict.fromkeys(
-        ("image_width", "image_height"), lambda value: are_numbers([value], 1, LARGEST_CANVAS) and value >= 0
-    ),
+    **dict.fromkeys(("image_width", "image_height"), lambda value: are_numbers([value], 1, MAX_CANVAS) and value >= 0),
     "event_type": lambda value: value == "click",
     "screen_pos": lambda value: isinstance(value, list | tuple) and len(value) == 1 and _is_on_screen(value[0]),
     **dict.fromkeys(("start_screen_pos", "end_screen_pos"), _is_on_screen),

@@ -46,7 +46,7 @@ def _outlined(picture: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np
     return picture
 
 
-LARGEST_PX = 6
+MAX_DOT_PX = 6
 """Side of the largest square."""
 
 
@@ -67,7 +67,7 @@ def render_points(
     # Far to near: for repeated indices NumPy keeps the last value.
     order = inside[np.argsort(-z[inside], kind="stable")]
     pixels, z, colors = pixels[order], z[order], colors[order]
-    side = int(np.clip(np.ceil(camera.fy * size / np.median(z)), 1, LARGEST_PX))
+    side = int(np.clip(np.ceil(camera.fy * size / np.median(z)), 1, MAX_DOT_PX))
     corner = np.floor(pixels - (side - 1) / 2).astype(int)
     offsets = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)
     x, y = np.moveaxis(corner[:, None] + offsets, -1, 0)

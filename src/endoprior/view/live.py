@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 REFRESH_SECONDS = 2.0
 """Least time between two displayed states."""
-LARGEST_SHARE = 0.2
+MAX_TIME_SHARE = 0.2
 """Largest share of the time for refreshing; slow images are refreshed less often. User input is handled at once."""
 
 
@@ -43,7 +43,7 @@ class LiveView:
         self.viewer.work()
         if refreshes:
             now = clock.monotonic()
-            self._due = now + max(REFRESH_SECONDS, (now - began) / LARGEST_SHARE)
+            self._due = now + max(REFRESH_SECONDS, (now - began) / MAX_TIME_SHARE)
 
     def close(self) -> None:
         if self.viewer is not None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import viser
 
 
-MOST_UNDO = 100
+MAX_UNDO = 100
 """Number of steps that can be undone."""
 Mask = NDArray[np.bool_]
 """(H, W) True on tools."""
@@ -62,7 +62,7 @@ class MaskEdits:
 
     def begin(self) -> None:
         """Begin a stroke: `undo` goes back to here."""
-        self._undo = [*self._undo, self._state][-MOST_UNDO:]
+        self._undo = [*self._undo, self._state][-MAX_UNDO:]
 
     def draw(self, frame: int, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> None:
         """Continue the stroke through points (x, y), px of the mask, as `stroke`."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 SURE = 0.5
 """Least confidence of a track that is not drawn faded."""
-MOST_PICKED = 100
+MAX_PICKED = 100
 """Largest number of clicked points with a track; the next click drops the first."""
 
 
@@ -196,7 +196,7 @@ class DrawnTracks:
 
     def pick(self, point: NDArray, frame: int) -> None:
         """Start a track at a clicked point (3,), world axes, mm."""
-        self.picked = [*self.picked, self._viewable.follow(point[None], [frame])][-MOST_PICKED:]
+        self.picked = [*self.picked, self._viewable.follow(point[None], [frame])][-MAX_PICKED:]
 
     def clear(self) -> None:
         self.picked = []

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from ..core.geometry import length_unit
-from ..data.known_length import MOST_MM
+from ..data.known_length import MAX_MM
 from .incoming import are_numbers
 from .viewable import Layer, ViewSettings
 
@@ -96,7 +96,7 @@ class Panel:
             self.save_scene = gui.add_button_group("Model", (PLY, SLICER, MESH), visible=trained, hint=hint)
         with gui.add_folder("Scale", visible=viewable.can_scale):
             hint = "Measure a distance of this length. All lengths of the folder become mm."
-            self.known_mm = gui.add_number("Known length, mm", 0.0, min=0.0, max=MOST_MM, hint=hint)
+            self.known_mm = gui.add_number("Known length, mm", 0.0, min=0.0, max=MAX_MM, hint=hint)
             self.save_scale = gui.add_button("Save scale")
             self.scaled = gui.add_markdown("")
         with gui.add_folder("Correct tool masks", visible=viewable.mask_edits is not None):

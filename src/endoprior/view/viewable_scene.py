@@ -33,7 +33,7 @@ from .viewport import shrunk_camera
 
 VALUE_LAYERS = ("displacement", "stretch", "prior", "support")
 """Layers that are one value per Gaussian. Browsers can render them and color."""
-LARGEST_DIFFERENCE = 0.25
+MAX_DIFFERENCE = 0.25
 """Mean absolute color difference that is shown in red."""
 DOT_PX, DOT_OPACITY = 0.6, 0.98
 """Standard deviation of a dot in the endoscope image."""
@@ -91,7 +91,7 @@ class ViewableScene:
         elif kind == "difference":
             shown = self._rendered("color", replace(settings, smoke=True), camera)
             difference = cv2.absdiff(shown, original).mean(-1) / 255
-            picture = colorize(difference, 0, LARGEST_DIFFERENCE)
+            picture = colorize(difference, 0, MAX_DIFFERENCE)
         else:
             picture = self._rendered(kind, settings, camera)
         tool = ~layers.fitted(frame.tissue_mask, camera)
@@ -247,7 +247,7 @@ class ViewableScene:
             "stretch": f"largest stretch since frame {since}: {stretch}; black: not seen then",
             "prior": "texture-prior score of the Gaussians: blue 0 to red 1",
             "support": "share of the frames that show this tissue: blue none, or its depth is a guess, to red all",
-            "difference": f"rendered minus input: blue 0 to red {LARGEST_DIFFERENCE:.0%}",
+            "difference": f"rendered minus input: blue 0 to red {MAX_DIFFERENCE:.0%}",
         }.get(settings.layer, "")
 
 

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..core.geometry import quaternion_to_matrix
 from ..core.types import Camera
 
-LEAST_ASPECT, LARGEST_ASPECT = 0.25, 4.0
+MIN_ASPECT, MAX_ASPECT = 0.25, 4.0
 """The aspect ratio of a canvas is clamped to this range."""
-LEAST_STEPS = 24
+MIN_STEPS = 24
 """Images of a video between two saved views of the same frame."""
 
 
@@ -98,7 +98,7 @@ def bounded_aspect(width: float, height: float) -> float:
     """width / height of a canvas, clamped; 1 for an empty canvas."""
     if not (0 < width < float("inf") and 0 < height < float("inf")):
         return 1.0
-    return min(max(width / height, LEAST_ASPECT), LARGEST_ASPECT)
+    return min(max(width / height, MIN_ASPECT), MAX_ASPECT)
 
 
 def _square_pixels(camera: Camera) -> Camera:
@@ -149,7 +149,7 @@ def interpolate(places: Sequence[PathPoint]) -> list[PathPoint]:
     first, path = places[0].camera, []
     same_size = [PathPoint(place.frame, _between(first, place.camera, 1.0)) for place in places]
     for a, b in pairwise(same_size):
-        steps = abs(b.frame - a.frame) or LEAST_STEPS
+        steps = abs(b.frame - a.frame) or MIN_STEPS
         for share in np.linspace(0, 1, steps, endpoint=False):
             frame = int(np.rint(a.frame + share * (b.frame - a.frame)))
             path.append(PathPoint(frame, _between(a.camera, b.camera, share)))

@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 UNKNOWN_GRAY = 128
-LEAST_DISPLACEMENT, LEAST_STRETCH = 1e-3, 0.05
+MIN_DISPLACEMENT, MIN_STRETCH = 1e-3, 0.05
 """The color scales reach at least this far, so that rounding is not colored."""
 
 
 def displacement_span(values: NDArray) -> tuple[float, float]:
     """Ends of the color scale: 0 to the 98th percentile of what is known."""
-    return 0.0, _reach(values, LEAST_DISPLACEMENT)
+    return 0.0, _reach(values, MIN_DISPLACEMENT)
 
 
 def stretch_span(values: NDArray) -> tuple[float, float]:
     """Ends of the color scale, as far below 1 as above it: unchanged tissue is in the middle."""
-    reach = _reach(np.abs(values - 1), LEAST_STRETCH)
+    reach = _reach(np.abs(values - 1), MIN_STRETCH)
     return 1 - reach, 1 + reach
 
 

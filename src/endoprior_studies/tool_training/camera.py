@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .noise import Field, fractal_field, log_uniform, smooth_field
 
-MOST_SMOKE = 0.85
+MAX_SMOKE = 0.85
 """Largest share of smoke in a color: through more of it, a tool cannot be told."""
 
 
@@ -92,7 +92,7 @@ def smoked(rng: Generator, image: Field) -> Field:
     share = dense * (1 + 0.6 * fractal_field(rng, size, log_uniform(rng, 40, 200), 4))
     if rng.random() < 0.4:
         share = share * rng.uniform(0, 0.6) + rng.uniform(0.3, 0.85) * _plume(rng, size)
-    share = np.clip(share, 0, MOST_SMOKE)
+    share = np.clip(share, 0, MAX_SMOKE)
     tint = np.array([1, rng.uniform(0.75, 1.04), rng.uniform(0.6, 1.15)], np.float32)
     tint *= np.float32(rng.uniform(0.35, 0.95))
     return image + share[..., None] * (tint - image)

@@ -28,7 +28,7 @@ CLASSES, LABELS, LISTED = "SegmentationClass", "labelmap.txt", Path("ImageSets",
 PNG_HINT = "Export the task from CVAT as `Segmentation mask 1.1` again."
 XML_HINT = "Export the task from CVAT as `CVAT for images 1.1`."
 SHAPES = ("mask", "polygon")
-MOST_PX = 1 << 16  # largest coordinate of a point
+MAX_COORDINATE_PX = 1 << 16  # largest coordinate of a point
 Color = tuple[int, int, int]
 
 
@@ -149,7 +149,7 @@ def _paint_polygon(mask: Mask, given: dict[str, str]) -> None:
     if any(len(pair) != 2 for pair in pairs):
         raise ValueError("points that are not x,y;x,y")
     points = np.array(pairs, float)
-    if not (np.abs(points) < MOST_PX).all():
+    if not (np.abs(points) < MAX_COORDINATE_PX).all():
         raise ValueError("points far outside of the image")
     painted = mask.astype(np.uint8)
     # OpenCV counts centers of pixels from 0.

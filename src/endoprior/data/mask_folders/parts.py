@@ -14,7 +14,7 @@ from ...core.checks import input_error
 from ..files import sorting_keys
 from ..images import Size
 from ..mask_files import OPTION, HighValues, Mask, asked_labels, read_user_mask
-from ..reading import MOST_PIXELS
+from ..reading import MAX_PIXELS
 
 # A label with a word of the first set is not a tool; with one of the third it is, such as tissue forceps; with one of
 # the second alone it is not.
@@ -102,7 +102,7 @@ def _is_tool(label: str) -> bool | None:
 def mask_of_runs(runs: Sequence[int], num_pixels: int) -> Mask:
     """(num_pixels,) from lengths of runs outside, inside, ... of an object; ValueError if they do not fill the mask."""
     lengths = np.asarray(runs, np.int64)
-    if num_pixels > MOST_PIXELS or lengths.ndim != 1:
+    if num_pixels > MAX_PIXELS or lengths.ndim != 1:
         raise ValueError(f"run lengths of {num_pixels} px")
     # Each alone, too: the sum of huge numbers can wrap around.
     if ((lengths < 0) | (lengths > num_pixels)).any() or int(lengths.sum()) != num_pixels:

@@ -21,7 +21,7 @@ from ..reading import read_bytes, read_text
 from .parts import MaskFolder, MaskFrame, mask_of_coco, tool_labels, union, union_of_files
 
 PALETTE_IMAGE = 3  # color type in the header of a PNG
-MOST_FRAMES = 10_000_000  # of a video
+MAX_FRAMES = 10_000_000  # of a video
 HINT = "Write it with the program of SA-V, or pass masks as PNG."
 
 
@@ -80,7 +80,7 @@ def sav_file(file: Path, asked: str) -> MaskFolder | None:
     wanted = [i for i, name in enumerate(ids) if name in tools]
     # Every fourth frame of the video is annotated: the number of a mask is that of its frame in the video.
     total = stored.get("video_frame_count")
-    known = total if isinstance(total, int | float) and 0 < total < MOST_FRAMES else 0
+    known = total if isinstance(total, int | float) and 0 < total < MAX_FRAMES else 0
     step = max(1, round(known / len(masklets)))
 
     def reader(frame: list[Any]):

@@ -25,7 +25,7 @@ from .tracks import REFERENCES, chained_flow
 
 PARTS = {"near": (0, 5), "middle": (5, 15), "far": (15, math.inf)}
 """Distance of a point from tools and from borders of the image, mm on the tissue, by the name of the part."""
-LEAST_RATIO = 1.1
+MIN_RATIO = 1.1
 """The direction of the largest stretch is compared where the two true stretches differ by this factor or more."""
 HIDDEN = "hidden"  # The part of points that a frame does not show
 OVER_ALL = (
@@ -118,7 +118,7 @@ def compute(context: EvaluationContext) -> None:
 def deformation_errors(found: Deformed, true: Deformed, parts: dict[str, NDArray[np.bool_]]) -> dict[str, float]:
     """Every score of `ERRORS` by name; NaN where no point of a part has a value. `parts`: (T, P) by name; "" is all."""
     cosine = np.abs((found.strain.direction * true.strain.direction).sum(-1)).clip(0, 1)
-    is_directed = true.strain.stretch[..., 0] >= LEAST_RATIO * true.strain.stretch[..., 1]
+    is_directed = true.strain.stretch[..., 0] >= MIN_RATIO * true.strain.stretch[..., 1]
     errors = {
         "deformation_displacement_mm": np.linalg.norm(found.displacement - true.displacement, axis=-1),
         "deformation_stretch": np.abs(found.strain.stretch - true.strain.stretch)[..., 0],

@@ -20,7 +20,7 @@ from .image import check_finite_float, checked_mask
 if TYPE_CHECKING:
     from ..context import EvaluationContext
 
-LEAST_ALPHA = 1e-6
+MIN_ALPHA = 1e-6
 SCORES = (
     Score(
         "depth_rmse_mm", "depth RMSE", "mm", False, 3,
@@ -59,7 +59,7 @@ def compute(context: EvaluationContext) -> None:
         values = []
         for frame in context.frames:
             out = context.scene.render(frame.time, frame.camera)
-            depth = (out.depth / out.alpha.clamp(min=LEAST_ALPHA)).cpu().numpy()
+            depth = (out.depth / out.alpha.clamp(min=MIN_ALPHA)).cpu().numpy()
             values.append(depth_rmse(depth, frame.depth, frame.tissue_mask & frame.depth_valid))
         context.add_mean("depth_rmse_by_alpha_mm", values, "no tissue with measured depth")
     with context.skip_if_unavailable("depth_instability_mm"):

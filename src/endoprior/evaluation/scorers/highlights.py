@@ -10,7 +10,7 @@ from ..context import EvaluationContext, to_uint8
 from ..score import Score
 from .image import psnr_tissue
 
-LEAST = 10.0
+MIN_HIGHLIGHT_LEVELS = 10.0
 """Pixels count where a highlight adds at least this much to the mean of the three colors, of 255."""
 SCORES = (
     Score(
@@ -38,7 +38,7 @@ def compute(context: EvaluationContext) -> None:
             true, lit = truth.no_highlights(frame.index), truth.tissue(frame.index)
             if true is None or lit is None:
                 continue
-            below = frame.tissue_mask & (lit.mean(-1) - true.mean(-1) >= LEAST)
+            below = frame.tissue_mask & (lit.mean(-1) - true.mean(-1) >= MIN_HIGHLIGHT_LEVELS)
             target = true / np.float32(255)
             rendered = to_uint8(scene.render(frame.time, frame.camera).color.cpu().numpy()) / np.float32(255)
             taken_out.append(psnr_tissue(rendered, target, below))

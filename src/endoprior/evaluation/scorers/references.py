@@ -60,12 +60,12 @@ STARTS, AHEAD, GRID = 6, 12, 16
 """Frames from which points are followed, for so many frames, and the number of points along the wider side."""
 HALF = np.float32(0.5)  # OpenCV counts pixels from the center of the first one, we from its edge
 REFERENCE_WIDTH_PX = 640
-LEAST_ANGLE = math.radians(1.5)  # rays that meet at a smaller angle do not tell depth
-MOST_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, are not of one resting point
+MIN_ANGLE = math.radians(1.5)  # rays that meet at a smaller angle do not tell depth
+MAX_GAP_PX = 1.5  # rays that miss each other by more, seen from the camera, are not of one resting point
 MIN_TRACKED_POINTS, MIN_TRACKED_SHARE = 40, 0.1
 """Least number of points that a score rests on, and their share of all that lie on tissue: a few beside a dark tube do
 not speak for its depth."""
-RELIEF_POINTS, LEAST_RELIEF = 100, 0.03
+RELIEF_POINTS, MIN_RELIEF = 100, 0.03
 """Least number of points that tell the relief, and the median by which the logarithm of their depth must differ."""
 FEW_POINTS = "too few points could be followed on tissue"
 STANDS = "the camera stands still"
@@ -172,7 +172,7 @@ def _point_references(context: EvaluationContext, scene: Scene) -> None:
 def relief_agreement(relief: NDArray[np.floating], least: float = 0) -> float:
     """Correlation of true and rendered relief (2, P), of `least` points or more; NaN where the true one is not seen."""
     relief = relief[:, np.abs(relief[0]) < 1]  # beyond, rays met by chance
-    if relief.shape[1] < max(RELIEF_POINTS, least) or np.median(np.abs(relief[0])) < LEAST_RELIEF:
+    if relief.shape[1] < max(RELIEF_POINTS, least) or np.median(np.abs(relief[0])) < MIN_RELIEF:
         return math.nan
     true, told = relief - relief.mean(1, keepdims=True)
     return float((true * told).sum() / max(float(np.sqrt((true**2).sum() * (told**2).sum())), 1e-12))
@@ -229,5 +229,5 @@ def triangulated(
     back = (cosine * (a @ between) - (b @ between)) / sine2
     on_first, on_last = origins[0] + along[:, None] * a, origins[1] + back[:, None] * b
     pixels, z = project((on_first + on_last) / 2, first)
-    meet = (along > 0) & (back > 0) & (z > 0) & (np.linalg.norm(pixels - start, axis=1) < MOST_GAP_PX)
-    return z, meet & (np.arccos(np.clip(cosine, -1, 1)) > LEAST_ANGLE)
+    meet = (along > 0) & (back > 0) & (z > 0) & (np.linalg.norm(pixels - start, axis=1) < MAX_GAP_PX)
+    return z, meet & (np.arccos(np.clip(cosine, -1, 1)) > MIN_ANGLE)

@@ -24,7 +24,7 @@ SINGLE_WIDTH = 4.0  # width of the weight of one observation, standard deviation
 DEPTH_WIDTH = 3.0  # width of the weight of one depth, standard deviations
 DENSE_LIMIT = 900  # up to this many unknowns of the cameras, their system is solved as a dense matrix
 INLIER_PX = 2.5  # largest reprojection error of an inlier of RANSAC, px of an image 640 px wide
-FEWEST = 12  # with fewer points there is no pose
+MIN_POINTS = 12  # with fewer points there is no pose
 
 
 def residuals(
@@ -275,7 +275,7 @@ def coarse_pose(
     matrix: NDArray, points: NDArray, pixels: NDArray, guess: NDArray | None, inlier_px: float
 ) -> tuple[NDArray, NDArray] | None:
     """World-to-camera (4, 4) by perspective-n-point with RANSAC, and (N,) its inliers; None if there is none."""
-    if len(points) < FEWEST:
+    if len(points) < MIN_POINTS:
         return None
     turn = shift = None
     if guess is not None:
@@ -285,7 +285,7 @@ def coarse_pose(
         points, pixels.astype(np.float64), matrix, None, turn, shift, guess is not None,
         iterationsCount=200, reprojectionError=inlier_px, confidence=0.999,
     )  # fmt: skip
-    if not done or found is None or len(found) < FEWEST or not np.isfinite(turn).all():
+    if not done or found is None or len(found) < MIN_POINTS or not np.isfinite(turn).all():
         return None
     inlier, pose = np.isin(np.arange(len(points)), found), np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()

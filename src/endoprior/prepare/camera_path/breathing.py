@@ -24,7 +24,7 @@ CYCLES = 3.0  # fewer breaths are not told from the camera
 SHORTEST = 8  # frames of the fastest breath
 SAMPLE = 4000  # observations from which the period is found
 SPACING = 12  # frames of a breath that are adjusted, and ...
-MOST_CAMERAS = 220  # ... at most in all: a longer clip is left to the camera
+MAX_CAMERAS = 220  # ... at most in all: a longer clip is left to the camera
 SIGNIFICANT = 0.03  # share of the residuals that one period must explain ...
 PEAK = 10.0  # ... and how many times more than the median period
 SMOOTH = 20.0  # weight of the acceleration of the camera, 1/mm; rotation counts at the distance of the tissue
@@ -74,7 +74,7 @@ def separate_breathing(follower: Follower, keyframes: list[int]) -> Breathing | 
         return None
     step = max(1, round(found / SPACING))
     frames = np.union1d(everything[::step], keyframes)
-    if len(frames) > MOST_CAMERAS:
+    if len(frames) > MAX_CAMERAS:
         return None
     ids, seen = tracks.of_frames(list(frames), follower.scales)
     poses, points, coefficients, weight = separate(

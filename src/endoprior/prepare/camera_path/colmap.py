@@ -27,15 +27,15 @@ from .follow import Follower
 from .own import finished_path, place_frames
 from .tracks import CameraPath, PoseInput, Tracks
 
-ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4  # a longer clip is mapped by every second to fourth frame
+ENOUGH_IMAGES, MAX_STRIDE = 150, 4  # a longer clip is mapped by every second to fourth frame
 LONGEST = 1000  # longer clips are mapped only if COLMAP is asked for: it takes seconds a frame
 DEFORMING = 0.1  # tracks below this weight deform; the tissue around them is masked ...
 AROUND = 40  # ... within the image width divided by this
 SECONDS_AN_IMAGE = 1.0  # about the time on two cores. Mapping that alone takes longer is stopped: see `time_note`.
-LEAST_SECONDS = 60  # mapping may always take this long
+MIN_SECONDS = 60  # mapping may always take this long
 MIN_REGISTERED_SHARE = 0.3  # a model with a smaller share of the frames is no path of the clip
 PARALLAX = 0.02  # least spread of the rays to a point, rad, whose position counts for the scale
-FEWEST = 10  # with fewer such points in a frame, its scale is that of the frames around
+MIN_POINTS = 10  # with fewer such points in a frame, its scale is that of the frames around
 STRIDE = 3  # points are placed by every third frame and all keyframes: neighbors add nothing
 
 
@@ -63,7 +63,7 @@ def colmap_path(
     """
     import pycolmap
 
-    stride = min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
+    stride = min(-(-count // ENOUGH_IMAGES), MAX_STRIDE)
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -110,7 +110,7 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     mapping.extract_colors = False
     mapping.mapper.init_min_tri_angle = 4.0
     mapping.max_num_models = 2
-    limit = int(max(LEAST_SECONDS, SECONDS_AN_IMAGE * len(list((folder / "images").iterdir()))))
+    limit = int(max(MIN_SECONDS, SECONDS_AN_IMAGE * len(list((folder / "images").iterdir()))))
     mapping.max_runtime_seconds = limit
     device, single = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
     options = {"reader_options": reader, "extraction_options": extraction, "device": device}
@@ -148,7 +148,7 @@ def with_poses(follower: Follower, poses: NDArray, known: NDArray[np.bool_], foc
         ids, depths = tracks.ids[f], tracks.depths[f]
         z = position[ids] @ poses[f][2, :3] + poses[f][2, 3]
         use = good[ids] & (depths > 0) & (z > 0)
-        if use.sum() >= FEWEST:
+        if use.sum() >= MIN_POINTS:
             scales[f] = np.median(z[use] / depths[use])
     there = np.flatnonzero(np.isfinite(scales))
     if len(there):

@@ -35,7 +35,7 @@ fibers stay where they are while the view moves."""
 GUESS_PX = 10.0  # parallax: a corner is this far from where the image as a whole goes, px of an image 640 px wide
 KEYPOINTS = 600
 RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
-FEWEST_INLIERS = 20  # fewer matches that one pose explains may be chance
+MIN_POSE_INLIERS = 20  # fewer matches that one pose explains may be chance
 INLIER_PX = 4.0  # reprojection error of a match, px of an image 640 px wide: the tissue may have moved in between
 
 
@@ -198,11 +198,11 @@ def match_keyframe(
 ) -> KeyframeMatch | None:
     """Find the pose of `new` from what it shares with `old`; None if that is too little."""
     first, second = _matches(old.descriptors.astype(np.float32), new.descriptors.astype(np.float32))
-    if len(first) < FEWEST_INLIERS:
+    if len(first) < MIN_POSE_INLIERS:
         return None
     points = back_projected(lens.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
     found = coarse_pose(lens.matrix, points, new.pixels[second], None, INLIER_PX * lens.px)
-    if found is None or found[1].sum() < max(FEWEST_INLIERS, 0.25 * len(first)):
+    if found is None or found[1].sum() < max(MIN_POSE_INLIERS, 0.25 * len(first)):
         return None
     pose, inlier = found
     z = points[inlier] @ pose[2, :3] + pose[2, 3]

@@ -20,12 +20,12 @@ from .even_view import EvenView, Warp
 from .partners import choose_partners
 from .tracks import PoseInput
 
-CORNERS, FEWEST_IN_FRAME, MOST_IN_FRAME = 6000, 30, 150  # of all frames; at least and at most of one
+CORNERS, MIN_IN_FRAME, MAX_IN_FRAME = 6000, 30, 150  # of all frames; at least and at most of one
 QUALITY, APART = 0.01, 1 / 60  # of a corner, to the best one; distance to the next, as a share of the width
 INNER_PX = 4  # corners and matches keep so far from what is not usable
 WINDOW_PX, LEVELS = 21, 1  # of the optical flow
 STOP = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005
-MOST_BACK_PX, MOST_SHIFT_PX = 0.5, 8.0  # a match leads back to its corner, and is near where the path expects it
+MAX_BACK_PX, MAX_SHIFT_PX = 0.5, 8.0  # a match leads back to its corner, and is near where the path expects it
 CONTRAST = 2.5  # standard deviations of the detail that the flow tells apart
 BYTES_PER_PX = 100  # memory in which a thread matches a frame
 
@@ -64,7 +64,7 @@ def match_frames(
         matrix: (3, 3) K at `size`, px; the left-most pixel is centered at 0. size: (w, h) at which to match, px.
     """
     pictures: BoundedCache[_Picture] = BoundedCache(cache_bytes(), lambda each: 6 * each.depth.size)
-    everything, count = range(len(usable)), int(np.clip(CORNERS / max(len(usable), 1), FEWEST_IN_FRAME, MOST_IN_FRAME))
+    everything, count = range(len(usable)), int(np.clip(CORNERS / max(len(usable), 1), MIN_IN_FRAME, MAX_IN_FRAME))
 
     def picture(i: int) -> _Picture:
         return pictures.get(i, lambda: _picture(frame(i), size))
@@ -117,7 +117,7 @@ def _found(
     x, y, _ = (each.astype(np.float32) for each in warp.at(inverse))
     warped = np.asarray(cv2.remap(other.detail_u8, x, y, cv2.INTER_LINEAR, borderValue=128), np.uint8)
     now, back, good = follow_and_return(detail_u8, warped, pixels, side_px=WINDOW_PX, halvings=LEVELS, criteria=STOP)
-    good &= (np.hypot(*(back - pixels).T) < MOST_BACK_PX) & (np.hypot(*(now - pixels).T) < MOST_SHIFT_PX)
+    good &= (np.hypot(*(back - pixels).T) < MAX_BACK_PX) & (np.hypot(*(now - pixels).T) < MAX_SHIFT_PX)
     place = np.stack([cv2.remap(each, now[:, :1], now[:, 1:], cv2.INTER_LINEAR).ravel() for each in (x, y)], 1)
     inner = cv2.remap(other.inner, place[:, :1], place[:, 1:], cv2.INTER_NEAREST, borderValue=0).ravel() > 0
     return np.where((good & inner)[:, None], place, np.nan).astype(np.float32)

@@ -29,9 +29,9 @@ PARTNERS = 3  # old keyframes that each new one is matched with at most
 LOW_PX, HIGH_PX = 0.25, 0.5
 """The camera rests while rigid tissue stays this near to where it was, px of an image 640 px wide; once at rest, it
 moves when it is beyond the second value (hysteresis)."""
-FEWEST_FRAMES = 8  # a shorter rest is none: slow motion looks the same
+MIN_REST_FRAMES = 8  # a shorter rest is none: slow motion looks the same
 RIGID = 0.5  # weight of a track that counts as rigid tissue
-FEWEST_TRACKS = 20
+MIN_TRACKS = 20
 
 
 def own_path(
@@ -193,9 +193,9 @@ def resting(tracks: Tracks, explained: NDArray[np.bool_]) -> list[tuple[int, int
         last, limit = first, LOW_PX * tracks.lens.px
         while last + 1 < count and explained[last + 1] and _shift(tracks, first, last + 1) < limit:
             last += 1
-            if last - first + 1 >= FEWEST_FRAMES:
+            if last - first + 1 >= MIN_REST_FRAMES:
                 limit = HIGH_PX * tracks.lens.px
-        if last - first + 1 >= FEWEST_FRAMES:
+        if last - first + 1 >= MIN_REST_FRAMES:
             spans.append((first, last))
             first = last
         first += 1
@@ -206,7 +206,7 @@ def _shift(tracks: Tracks, first: int, other: int) -> float:
     """Median distance, px, of rigid tracks between two frames; inf if too few are seen in both."""
     shared, a, b = np.intersect1d(tracks.ids[first], tracks.ids[other], return_indices=True)
     rigid = (tracks.weight[shared] > RIGID) & ~tracks.keypoint[shared]
-    if rigid.sum() < FEWEST_TRACKS:
+    if rigid.sum() < MIN_TRACKS:
         return np.inf
     moved = tracks.pixels[other][b[rigid]] - tracks.pixels[first][a[rigid]]
     return float(np.median(np.hypot(*moved.T)))

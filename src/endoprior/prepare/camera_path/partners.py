@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-LEAST_DEGREES, WANTED_DEGREES, MOST_DEGREES = 2.0, 5.0, 12.0
+MIN_DEGREES, WANTED_DEGREES, MAX_DEGREES = 2.0, 5.0, 12.0
 """Median parallax below which a frame is no partner, at which the first one in time is taken, above which none is."""
 SECOND = 0.6  # share of `WANTED_DEGREES` of the second partner on each side: it tells motion of tissue from depth
 REACH = 60  # frames on each side in which partners are searched
@@ -47,7 +47,7 @@ def _partners(
     for side in (range(i - 1, max(i - 1 - REACH, -1), -1), range(i + 1, min(i + 1 + REACH, len(poses)))):
         others = [j for j in side if usable[j]]
         degrees = dict(zip(others, parallax(poses, i, others, matrix, size, distance), strict=True))
-        fit = [j for j in others if LEAST_DEGREES <= degrees[j] <= MOST_DEGREES]
+        fit = [j for j in others if MIN_DEGREES <= degrees[j] <= MAX_DEGREES]
         if not fit:
             continue
         first = next((j for j in fit if degrees[j] >= WANTED_DEGREES), max(fit, key=lambda j: degrees[j]))

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Kind = Literal["static", "turning", "translating", "forward", "backward", "unknown"]
-LEAST_PX = 1.5  # a camera whose way shifts the image by less over such a gap (median) is at rest, px at a width of 640
+MIN_CAMERA_SHIFT_PX = 1.5
+"""A camera whose way shifts the image by less over such a gap (median) is at rest, px at a width of 640."""
 OFF_PX, OFF_SHARE = 4.0, 0.5  # a step contradicts the images if its shift is off by more than both, px at 640
 WAY = 0.2  # share of the shift that a way causes, below which the camera only turns
 AXIAL = 0.7  # share of the length of the way along the optical axis, above which the camera drives along it
@@ -21,7 +22,7 @@ REACHES, LIKE = (1 / 8, 1 / 18, 1 / 36), 0.1
 left at the points after one reach is spread over the next (successive corrections)."""
 DOUBT = 0.05  # weight of no change beside that of one point at its place
 SMALL_WIDTH = 160  # the change is computed at this width, px
-MOST_RATIO = 6.0  # a distance is clipped to this ratio of the middle: the dark end of a tube has no measured one
+MAX_DEPTH_RATIO = 6.0  # a distance is clipped to this ratio of the middle: the dark end of a tube has no measured one
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class PathMotion:
         """Where its way leads; turning if it has hardly any."""
         if not len(self.parts_px):
             return "unknown"
-        if np.median(self.parts_px.max(1)) < LEAST_PX * self.px:
+        if np.median(self.parts_px.max(1)) < MIN_CAMERA_SHIFT_PX * self.px:
             return "static"
         if 1 - self.shares[TURN] < WAY:
             return "turning"
@@ -83,7 +84,7 @@ class DepthShape:
     def powered(self, depth: NDArray) -> NDArray[np.float32]:
         """Depth (H, W) with the power alone; 0 stays."""
         ratio = np.maximum(depth, 0) / self.middle
-        clipped = np.clip(ratio**self.power, 1 / MOST_RATIO, MOST_RATIO)
+        clipped = np.clip(ratio**self.power, 1 / MAX_DEPTH_RATIO, MAX_DEPTH_RATIO)
         return np.asarray(np.where(ratio > 0, self.middle * clipped, 0) * self.cosine, np.float32)
 
     def shaped(self, index: int, depth: NDArray) -> NDArray[np.float32]:

@@ -17,11 +17,11 @@ from .even_view import matrix_at
 from .matches import Matches, match_frames
 from .tracks import CameraPath, PoseInput, TrackingCamera
 
-LARGEST_WIDTH = 640  # frames are matched at this width at most, px
+MAX_WIDTH = 640  # frames are matched at this width at most, px
 PIXEL_STD = 0.3  # of a match, px of an image 640 px wide
 DEPTH_STD = 0.2  # of the depth so far, as a share of it: it holds the scale of the path
 FOCAL_PRIOR, FOCAL_STD = 0.2, 0.03  # of log f where it is assumed; a refined one is kept if it is known this well
-FEWEST = 30  # observations of a camera; with fewer it moves along with the nearest one that has more
+MIN_OBSERVATIONS = 30  # observations of a camera; with fewer it moves along with the nearest one that has more
 SEEN_IN = 3  # frames that see a corner by which the fit is judged
 FITS_PX = 0.5  # three quarters of the matches of a rigid scene are within this, px of an image 640 px wide
 RIGID = 0.5  # weight of a corner that follows the rigid scene
@@ -81,7 +81,7 @@ def refined_path(
 
 def _scaled(size: tuple[int, int]) -> tuple[int, int]:
     """(w, h) at which frames of (width, height) are matched, px."""
-    factor = min(1.0, LARGEST_WIDTH / size[0])
+    factor = min(1.0, MAX_WIDTH / size[0])
     return round(size[0] * factor), round(size[1] * factor)
 
 
@@ -118,7 +118,7 @@ def _observations(
     inverse = 1 / np.concatenate(depths).astype(np.float64)
     sigma = np.stack([np.full(len(inverse), PIXEL_STD * px), np.where(inverse > 0, DEPTH_STD * inverse, np.inf)], 1)
     seen = Observations(np.concatenate(cameras), np.concatenate(corners), np.concatenate(pixels), inverse, sigma)
-    known = np.bincount(seen.camera, minlength=camera.max() + 1) >= FEWEST
+    known = np.bincount(seen.camera, minlength=camera.max() + 1) >= MIN_OBSERVATIONS
     return seen, np.concatenate(points), known
 
 
@@ -143,7 +143,7 @@ def _scales(found: Adjusted, seen: Observations, count: int) -> NDArray[np.float
     ratio, camera = z * seen.inverse_depth[own], seen.camera[own]
     usual = float(np.median(ratio)) if len(own) else 1.0
     of_each = [ratio[camera == k] for k in range(count)]
-    return np.array([np.median(each) if len(each) >= FEWEST else usual for each in of_each])
+    return np.array([np.median(each) if len(each) >= MIN_OBSERVATIONS else usual for each in of_each])
 
 
 def _residual(matrix: NDArray, found: Adjusted, seen: Observations) -> float:

@@ -42,7 +42,7 @@ METHODS: dict[str, How] = {"auto": "best", "auto-own": "own", "estimate": "best"
 """Values of --poses that estimate a path; `still` and files do not."""
 ONLY_IF_MOVING = ("auto", "auto-own")  # those that do so only where the camera moves
 WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}  # the same, ten times faster
-FEWEST_POSED = 8  # frames; a shorter path is none
+MIN_POSED = 8  # frames; a shorter path is none
 SHAPINGS = 2
 """Where the camera drives ahead, triangulated points or the light of a tube fix the shape of relative depth, and the
 camera is followed again so often with the better depth."""
@@ -139,7 +139,7 @@ def sequence_path(
 def _doubt(path: CameraPath, motion: CameraMotion) -> str:
     """Why the path is no answer; empty if it is one."""
     posed = int(path.explained.sum())
-    if posed < max(FEWEST_POSED, min(motion.resting.sum(), len(path.explained))):
+    if posed < max(MIN_POSED, min(motion.resting.sum(), len(path.explained))):
         return f"only {posed} of {len(path.explained)} frames can be linked by poses"
     if path.kind == "static" and posed < SHOWN * len(path.explained):
         return f"the path rests, but only {posed} of {len(path.explained)} frames are on it"
@@ -151,7 +151,7 @@ def _doubt(path: CameraPath, motion: CameraMotion) -> str:
 def _unknown_path(motion: CameraMotion, why: str) -> tuple[CameraPath, list[str]]:
     """One camera for the longest stretch in which the view rests; all other frames are unexplained."""
     rests, count = motion.resting, len(motion.stretch)
-    if rests.sum() < min(FEWEST_POSED, max(2, count / 2)):  # most of a short clip are enough
+    if rests.sum() < min(MIN_POSED, max(2, count / 2)):  # most of a short clip are enough
         rests = np.zeros(count, bool)
     poses = np.tile(np.eye(4), (count, 1, 1))
     path = CameraPath(poses, rests, np.ones(count), UNKNOWN_POSES, is_unknown=True)

@@ -33,9 +33,9 @@ SHADED = 0.7  # share of the variance of log depth that brightness explains, if 
 SMALL_WIDTH, BLUR_PX = 80, 1.5  # w and the smoothing, px: vessels and grain are no tube
 DARK_PERCENT = 2.0  # of the tissue, for the dark place
 DARKER = 0.8  # log by which it is darker than the median of the tissue; phantoms: 1.0 to 2.8
-SECTORS, FEWEST_PX = 12, 30  # directions around the dark place, and px that one needs to count
+SECTORS, MIN_PX = 12, 30  # directions around the dark place, and px that one needs to count
 RISES = 0.5  # correlation of log brightness and log distance from which on a direction gets brighter
-MOST_RISE = 0.8  # share of the directions that do; phantoms of three seeds: 0.86 to 1
+MAX_RISE = 0.8  # share of the directions that do; phantoms of three seeds: 0.86 to 1
 OFTEN = 0.5  # share of the frames that look so
 
 
@@ -61,7 +61,7 @@ def shape_by_light(frames: Iterable[PoseInput], cosine: NDArray[np.float32]) -> 
     x, y = (without_means(v, frame, len(recedes)) for v in (np.concatenate(light), np.log(depths)))
     slope, clear = robust_slope(x, y)
     power = -EXPONENT / slope if slope < 0 else 0.0
-    if clear < SHADED or not LEAST_POWER < power < MOST_POWER:
+    if clear < SHADED or not MIN_POWER < power < MAX_POWER:
         return None
     return DepthShape(power, float(np.median(depths)), cosine, [], [])
 
@@ -78,7 +78,7 @@ def _brightness(rgb_u8: Image, tissue: Mask) -> tuple[NDArray, Mask]:
 
 def _recedes(bright: NDArray, usable: Mask) -> bool:
     """Whether one frame gets brighter in nearly all directions from its dark place."""
-    if usable.sum() < SECTORS * FEWEST_PX:
+    if usable.sum() < SECTORS * MIN_PX:
         return False
     limit, middle = np.percentile(bright[usable], [DARK_PERCENT, 50])
     if middle - limit < DARKER:
@@ -89,9 +89,9 @@ def _recedes(bright: NDArray, usable: Mask) -> bool:
     y, x = np.nonzero(usable)
     away = np.log(np.hypot(x - x0, y - y0) + BLUR_PX)
     sector = ((np.arctan2(y - y0, x - x0) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
-    parts = [at for k in range(SECTORS) if len(at := np.flatnonzero(sector == k)) > FEWEST_PX]
+    parts = [at for k in range(SECTORS) if len(at := np.flatnonzero(sector == k)) > MIN_PX]
     rises = [_correlation(away[at], bright[y[at], x[at]]) > RISES for at in parts]
-    return bool(rises) and float(np.mean(rises)) >= MOST_RISE
+    return bool(rises) and float(np.mean(rises)) >= MAX_RISE
 
 
 def _correlation(x: NDArray, y: NDArray) -> float:
@@ -100,8 +100,8 @@ def _correlation(x: NDArray, y: NDArray) -> float:
 
 
 PARALLAX_DEGREES = 2.0  # rays to a point differ by this, or its depth is that of the shading
-FEWEST = 200  # observations of such points
-LEAST_POWER, MOST_POWER = 1.15, 6.0
+MIN_OBSERVATIONS = 200  # observations of such points
+MIN_POWER, MAX_POWER = 1.15, 6.0
 CLEAR = 0.3  # share of the variance of log depth that the power explains
 
 
@@ -128,7 +128,7 @@ def fitted_shape(
     depths = np.concatenate(tracks.depths).astype(np.float64)
     good = path.explained[frame] & tracks.adjusted[ids] & (tracks.weight[ids] > 0.3) & (depths > 0)
     frame, ids, pixels, depths = frame[good], ids[good], pixels[good], depths[good]
-    if len(ids) < FEWEST:
+    if len(ids) < MIN_OBSERVATIONS:
         return before
     rays = tracks.points[ids] + np.einsum("nji,nj->ni", follower.poses[frame, :3, :3], follower.poses[frame, :3, 3])
     distance = np.linalg.norm(rays, axis=1)
@@ -139,7 +139,7 @@ def fitted_shape(
     z = np.einsum("nj,nj->n", follower.poses[frame, 2, :3], tracks.points[ids]) + follower.poses[frame, 2, 3]
     sure = (np.einsum("nj,nj->n", rays[first], rays[last]) < np.cos(np.deg2rad(PARALLAX_DEGREES))) & (z > 0)
     frame, pixels, depths, distance = frame[sure], pixels[sure], depths[sure], distance[sure]
-    if len(distance) < FEWEST:
+    if len(distance) < MIN_OBSERVATIONS:
         return before
     if before is not None:
         column, row = np.clip(np.round(pixels).astype(int), 0, np.array(cosine.shape[::-1]) - 1).T
@@ -147,7 +147,7 @@ def fitted_shape(
     x, y = (without_means(np.log(values), frame, count) for values in (depths, distance))
     slope, clear = robust_slope(x, y)
     power = slope * (before.power if before else 1.0)
-    if not LEAST_POWER < power < MOST_POWER or clear < CLEAR:
+    if not MIN_POWER < power < MAX_POWER or clear < CLEAR:
         return before
     if before is not None and not before.pixels:
         return replace(before, power=power)

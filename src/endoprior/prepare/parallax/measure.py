@@ -73,9 +73,9 @@ def checked(
 
 REACHES = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48, 1 / 96)  # standard deviations, as shares of the width
 DOUBT = 0.05  # weight of no change beside that of pixels that are sure
-LEAST = 0.1  # confidence below which a pixel does not speak
+MIN_CONFIDENCE = 0.1  # confidence below which a pixel does not speak
 SAME = 0.1  # difference of log depth that halves the weight of another frame: beyond, it shows another surface
-MOST_RATIO = 3.0  # of a measured depth to the guess, after one factor for the frame; beyond, it is a match by chance
+MAX_GUESS_RATIO = 3.0  # of a measured depth to the guess, after one factor for the frame; above, a chance match
 
 
 def bent(
@@ -87,10 +87,10 @@ def bent(
         guess: (h, w) depth, 0 where it is missing. inverse: (h, w) measured inverse depth.
         confidence: (h, w) of what was measured, in [0, 1].
     """
-    weight = np.where((guess > 0) & (confidence > LEAST), confidence**2, 0).astype(np.float32)
+    weight = np.where((guess > 0) & (confidence > MIN_CONFIDENCE), confidence**2, 0).astype(np.float32)
     left = -np.log(np.maximum(inverse * np.where(guess > 0, guess, 1), np.float32(1e-6))).astype(np.float32)
     field = np.full_like(left, _median(left, weight))
-    left = np.clip(left - field, -np.log(MOST_RATIO), np.log(MOST_RATIO)).astype(np.float32)
+    left = np.clip(left - field, -np.log(MAX_GUESS_RATIO), np.log(MAX_GUESS_RATIO)).astype(np.float32)
     for reach in REACHES:
         sigma = reach * guess.shape[1]
         spread = cv2.GaussianBlur(left * weight, (0, 0), sigma) / (cv2.GaussianBlur(weight, (0, 0), sigma) + DOUBT)
@@ -126,7 +126,7 @@ def _median(values: NDArray, weight: NDArray) -> float:
 
 
 MIN_MEASURED_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
-LEAST_FRAMES = 0.5  # share of the frames that have partners, below which the camera moves too little
+MIN_FRAME_SHARE = 0.5  # share of the frames that have partners, below which the camera moves too little
 BYTES_PER_PX = 400  # memory in which a thread measures a frame, bytes for each px of a fine view
 AROUND = 4  # frames on each side with which the depth of a frame is averaged
 
@@ -152,7 +152,7 @@ class ParallaxDepth:
     @property
     def doubt(self) -> str:
         """Why it is no answer; empty if it is one."""
-        if self.frames < LEAST_FRAMES:
+        if self.frames < MIN_FRAME_SHARE:
             return f"the camera moves too little beside {1 - self.frames:.0%} of the frames"
         if self.share < MIN_MEASURED_SHARE:
             return f"parallax and path agree on {self.share:.0%} of the tissue"

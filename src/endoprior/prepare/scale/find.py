@@ -27,7 +27,7 @@ from .shaft import frontier, tip_readings
 
 SHAFT_OPTION = "--shaft-mm"
 SAMPLES = 16  # number of frames in which the border of the view is looked for
-LEAST_MM, MOST_MM = 1.0, 20.0
+MIN_MM, MAX_MM = 1.0, 20.0
 """Range of diameters of shafts."""
 KNOW_OTHERWISE = "give a length that you know: `--known-length FRAME,X1,Y1,X2,Y2,MM`."
 Frame = Callable[[int], PoseInput]
@@ -37,9 +37,9 @@ def check_scale_options(known_length: Sequence[str], shaft_mm: float) -> None:
     """Raise InputError for values of the options that cannot be, or both of them."""
     for text in known_length:
         parse_known_length(text)
-    if shaft_mm and not LEAST_MM <= shaft_mm <= MOST_MM:
+    if shaft_mm and not MIN_MM <= shaft_mm <= MAX_MM:
         fix = f"`{SHAFT_OPTION} 8` for most robotic instruments, `{SHAFT_OPTION} 5` for most others."
-        raise input_error(SHAFT_OPTION, f"a diameter of {LEAST_MM:g} to {MOST_MM:g} mm", f"{shaft_mm:g}", fix)
+        raise input_error(SHAFT_OPTION, f"a diameter of {MIN_MM:g} to {MAX_MM:g} mm", f"{shaft_mm:g}", fix)
     if known_length and shaft_mm:
         fix = f"remove {SHAFT_OPTION}: a known length is the surer one."
         raise input_error("--known-length", f"no {SHAFT_OPTION}", f"{SHAFT_OPTION} {shaft_mm:g}", fix)

@@ -89,8 +89,8 @@ def axis_of(
 
 EDGE_PX = 1.5  # standard deviation of each end of an edge, at a width of 640 px
 AROUND = 0.75  # tissue is compared in this many shaft widths around the tip
-FEWEST_PX = 20  # of tissue with depth there
-MOST_STD = 0.35  # of the log distance of a tip: less sure ones say nothing
+MIN_PX = 20  # of tissue with depth there
+MAX_STD = 0.35  # of the log distance of a tip: less sure ones say nothing
 PLACE = 1 / 32  # of the image width: tips that are nearer to each other are one place, whose readings err alike
 FAR_OFF = 0.05  # share of readings that are wrong: another edge, no shaft
 WIDE = 4.0  # range of log s in which those are
@@ -132,7 +132,7 @@ def tip_readings(
     found = []
     for edges in shafts_of(tools, outside, rgb_u8):
         tissue = depth[_near(edges.tip, max(AROUND * edges.width, 6), depth.shape) & ~tools & ~outside & (depth > 0)]
-        if tissue.size < FEWEST_PX or (tip := _tip_depth(edges, matrix, radius_mm)) is None:
+        if tissue.size < MIN_PX or (tip := _tip_depth(edges, matrix, radius_mm)) is None:
             continue
         found.append(TipReading(frame, (*edges.tip,), tip[0] - float(np.log(np.median(tissue))), tip[1]))
     return found
@@ -181,7 +181,7 @@ def _tip_depth(edges: ShaftEdges, matrix: NDArray, radius_mm: float) -> tuple[fl
             if other is None:
                 return None
             variance += (float(np.mean(other)) - middle) ** 2
-    return (middle, float(np.sqrt(variance))) if variance <= MOST_STD**2 else None
+    return (middle, float(np.sqrt(variance))) if variance <= MAX_STD**2 else None
 
 
 def _two_depths(edges: ShaftEdges, ends: NDArray, matrix: NDArray, radius_mm: float) -> NDArray | None:

@@ -104,14 +104,14 @@ def _peak(change: NDArray, best: NDArray) -> NDArray:
 
 Mask = NDArray[np.bool_]
 
-LEAST_AREA = 0.003  # of the frame: a smaller tool has no long edges
+MIN_AREA = 0.003  # of the frame: a smaller tool has no long edges
 AT_BORDER_PX = 2.5  # so near to the end of the view, outlines follow the border and not the tool
 TOLERANCE_PX = 2.0  # of a mask's points around the line of its edge, at a width of 640 px
 STRAIGHT_SHARE = 0.8  # of an edge's points that must be within the tolerance
-LEAST_LENGTH = 0.15  # of an edge, in image widths
-LEAST_WIDTH = 0.015  # of a shaft, in image widths: below, an error of 1 px of the mask is 10 % of the distance
-LEAST_ASPECT = 2.5  # of the shorter edge's length to the width of the shaft
-MOST_TAPER = 0.35  # angle between the edges, radians: more is a jaw, or a shaft that points at the camera
+MIN_LENGTH = 0.15  # of an edge, in image widths
+MIN_WIDTH = 0.015  # of a shaft, in image widths: below, an error of 1 px of the mask is 10 % of the distance
+MIN_ASPECT = 2.5  # of the shorter edge's length to the width of the shaft
+MAX_TAPER = 0.35  # angle between the edges, radians: more is a jaw, or a shaft that points at the camera
 STEP = 1.15  # from one tried length of an edge to the next
 
 
@@ -147,7 +147,7 @@ def shafts_of(tools: Mask, outside: Mask, rgb_u8: NDArray[np.uint8] | None = Non
     smooth = None if rgb_u8 is None else smoothed(rgb_u8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats((tools & ~outside).astype(np.uint8), None, None, None, 8)
     for label in range(1, count):
-        if stats[label, cv2.CC_STAT_AREA] >= LEAST_AREA * height * width:
+        if stats[label, cv2.CC_STAT_AREA] >= MIN_AREA * height * width:
             found = _shaft(labels == label, depth_in_view, smooth)
             if found is not None:
                 yield found
@@ -160,7 +160,7 @@ def _shaft(tool: Mask, depth_in_view: NDArray[np.float32], smooth: NDArray[np.fl
     if chain is None:
         return None
     tolerance = TOLERANCE_PX * max(px / 640, 1.0)
-    one, other = (_straight(part, tolerance, LEAST_LENGTH * px) for part in (chain, chain[::-1]))
+    one, other = (_straight(part, tolerance, MIN_LENGTH * px) for part in (chain, chain[::-1]))
     if one is not None and other is not None and smooth is not None:
         between = np.mean([*one[1], *other[1]], 0)
         one, other = image_edge(smooth, one[1], between), image_edge(smooth, other[1], between)
@@ -176,7 +176,7 @@ def _shaft(tool: Mask, depth_in_view: NDArray[np.float32], smooth: NDArray[np.fl
     width = float(np.abs(lines @ [*inside, 1.0]).sum())
     inward = _unit(ends[1] - ends[0]) + _unit(other_ends[1] - other_ends[0])
     cosine = abs(float(lines[0, :2] @ lines[1, :2]))
-    if width < LEAST_WIDTH * px or min(lengths) < LEAST_ASPECT * width or cosine < np.cos(MOST_TAPER):
+    if width < MIN_WIDTH * px or min(lengths) < MIN_ASPECT * width or cosine < np.cos(MAX_TAPER):
         return None
     if np.linalg.norm(inward) < 1:  # the two edges do not run side by side
         return None

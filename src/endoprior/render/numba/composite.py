@@ -45,7 +45,7 @@ from . import tiles
 from .tiles import FIRST_ROWS, ID, SLOPES, SLOT, STRIPS, TILE_HEIGHT, TILE_WIDTH
 
 f4 = np.float32
-LOG2_ALPHA_MIN, LARGEST_ALPHA, STOP = f4(log2(ALPHA_MIN)), f4(ALPHA_MAX), f4(STOP_TRANSMITTANCE)
+LOG2_ALPHA_MIN, MAX_ALPHA, STOP = f4(log2(ALPHA_MIN)), f4(ALPHA_MAX), f4(STOP_TRANSMITTANCE)
 FORWARD_ROW = 5 * LANES
 """Numbers per row of a strip: planes of transmittance, and of red, green, blue, depth so far."""
 BACKWARD_ROW = 6 * LANES
@@ -76,7 +76,7 @@ def blend(exponent, transmittance):
     All are vectors.
     """
     zero = broadcast(f4(0.0))
-    alpha = smaller(simd.power_of_two(exponent), broadcast(LARGEST_ALPHA))
+    alpha = smaller(simd.power_of_two(exponent), broadcast(MAX_ALPHA))
     alpha = where_ge(exponent, broadcast(LOG2_ALPHA_MIN), alpha, zero)
     behind = fma(-transmittance, alpha, transmittance)
     stop = broadcast(STOP)
@@ -220,7 +220,7 @@ def _differentiate_pair(record, pair, left, top, state, sums):
             rest = load(state, place + 5 * LANES) - gain
             store(state, place + 5 * LANES, rest)
             # rest alpha / (1 - alpha), as weight = T alpha and behind = T (1 - alpha)
-            dp = where_ge(alpha, broadcast(LARGEST_ALPHA), zero, gain - rest * weight / behind)
+            dp = where_ge(alpha, broadcast(MAX_ALPHA), zero, gain - rest * weight / behind)
             dp_dy = dp * dy
             column_1 = column_1 + dp
             column_y = column_y + dp_dy
