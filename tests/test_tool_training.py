@@ -333,7 +333,7 @@ def test_the_best_a_middle_and_the_worst_frame_are_shown():
         def find(self, rgb_u8, view):
             mask = np.zeros_like(view)
             mask[:, : rgb_u8[0, 0, 0]] = True
-            return type("Found", (), {"mask": mask})
+            return type("Found", (), {"tool_mask": mask})
 
     nothing = np.zeros((32, 64), bool)
     frames = [

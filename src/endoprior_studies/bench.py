@@ -32,8 +32,8 @@ class Bench(Command):
     reproduce: the paper's tables on EndoNeRF data and SCARED, published figures beside yours; one table: reproduce/NAME
     with table1, table1_scared, table2, table3, table4, table5. sized: tables for two cores; one: sized/NAME with
     budgets, compared, depth_flags, growth, instability, ladder, matched, methods, primitives, regime, temporal. full:
-    most of them at full size. whole: each as released and fitted; clip, phantom: full size; kinds, parts: small frames;
-    own: your clip; mechanics: tissue that moves by a law. radiance: radiance fields."""
+    most at full size. whole: each as released and fitted; clip, phantom: full size; kinds, parts: small frames;
+    own: your clip; mechanics: laws of motion. radiance: radiance fields."""
     out: Path = field(metadata={"place": "OUT"})
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
