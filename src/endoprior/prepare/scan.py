@@ -33,7 +33,7 @@ from .source import open_source, quick_images
 LOOKS, RATES = 2400, (2.0, 10.0)
 """So many images are looked at, if that is not less or more than these rates, 1/s."""
 PICTURES = 8  # of these, for the timeline
-GLIMPSES = 24  # images that show which part of the frame is the endoscope's image
+NUM_SAMPLE_IMAGES = 24  # images that show which part of the frame is the endoscope's image
 BACK_S = 3.0  # tissue is looked for in the images of so long before, s
 BACK = (1, 2, 5, 12, 28)  # how many images before; each costs a comparison of features
 FROZEN = 0.12  # images are the same if their mean difference is below this, levels of 255
@@ -79,7 +79,7 @@ def scan_video(
     size = small_size(source.width, source.height)
     pictures = [
         np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8)
-        for each in source.glimpses(0.0, source.seconds, GLIMPSES)
+        for each in source.sample_images(0.0, source.seconds, NUM_SAMPLE_IMAGES)
     ]
     inside = view_mask(pictures)
     rate = float(np.clip(LOOKS / max(source.seconds, 1e-3), *RATES))

@@ -41,7 +41,7 @@ def draw_scan(
     figure = Figure(figsize=(15, 8), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 3]).flat
-    pictures = pictures or open_source(video, folder_rate).glimpses(0.0, whole, PICTURES)
+    pictures = pictures or open_source(video, folder_rate).sample_images(0.0, whole, PICTURES)
     for axis in np.atleast_1d(top.subplots(1, PICTURES)):
         axis.set_axis_off()
     for axis, image in zip(top.axes, pictures, strict=False):

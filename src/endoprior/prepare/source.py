@@ -88,7 +88,7 @@ class ImageFolder:
             stored = (stored >> (self._bits - 8)).astype(np.uint8)
         return SourceFrame(index, self.times[index], np.ascontiguousarray(stored[..., 2::-1]))
 
-    def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
+    def sample_images(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole time range."""
         inside = [index for index, time in enumerate(self.times) if start <= time < end] or [0]
         return [self.image(index).rgb_u8 for index in inside[:: max(len(inside) // count, 1)]]
@@ -142,7 +142,7 @@ class Animation:
                 yield SourceFrame(index, time, np.ascontiguousarray(pixels[..., :3]))
         self.notes = [f"{self.path.name}: {transparent(count)}"] if count else []
 
-    def glimpses(self, _start: float, _end: float, count: int) -> list[NDArray[np.uint8]]:
+    def sample_images(self, _start: float, _end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole file."""
         return [image.rgb_u8 for image in islice(self, 0, None, max(self.num_frames // count, 1))]
 

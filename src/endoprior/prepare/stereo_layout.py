@@ -20,7 +20,7 @@ exceeds that with one half upside down. Shading does not count: halves of a tube
 HALF_SIZE, DETAIL_PX = (192, 128), 3.0  # (width, height) of compared halves, and the size of their details, px
 BLOCK, OFF_ROWS, OFF_COLUMNS = (28, 24), 5, 40  # (width, height) of a block, px, and how far away its match can lie
 MIN_DETAIL = 1.0  # standard deviation of a block that shows something, levels
-GLIMPSES = 9  # number of images that tell the stereo layout
+NUM_SAMPLE_IMAGES = 9  # images that tell the stereo layout
 CONTENT = 3.0  # least standard deviation, levels, of a frame that shows something, in each of its rows and columns
 Image = NDArray[np.uint8]
 

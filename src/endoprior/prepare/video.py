@@ -34,7 +34,7 @@ STATES_END = ("matroska,webm", "nut")
 """FFmpeg's names of the formats whose duration is the time of the end, however late the first image is shown."""
 ARBITRARY_CLOCKS = ("mpegts", "mpeg")  # formats whose times do not count from the start of the recording
 PIXEL_ASPECTS = (0.25, 4.0)  # plausible width of a pixel, in heights
-LOOKED_AT = 300  # most images that are decoded to reach the time of a glimpse: as many as between two key frames
+LOOKED_AT = 300  # most images that are decoded to reach a time: as many as between two key frames
 SmallImage = Callable[..., NDArray[np.uint8]]
 """Called with a width and a height, px: the image (h, w, 3) of that size, or (h, w) gray values with `is_gray`."""
 HIGH_RANGE = {16: ("PQ", "smpte2084"), 18: ("HLG", "arib-std-b67")}
@@ -170,21 +170,21 @@ class Video:
                     began = seconds if began is None else began
                     yield seconds - began, partial(_small, image)
 
-    def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
+    def sample_images(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole time range, with all their rows; at least one."""
         end = min(end, self.seconds)
         wanted = [start + (i + 0.5) / count * max(end - start, 0.0) for i in range(count)]
         with self._open() as (container, track):
             if len(self.times) > LOOKED_AT:
-                glimpses = (self._glimpse(container, track, time) for time in wanted)
-                if found := [image for image in glimpses if image is not None]:
+                images = (self._image_near(container, track, time) for time in wanted)
+                if found := [image for image in images if image is not None]:
                     return found
         with self._open() as (container, track):
             positions = {min(bisect_left(self.times, time), LOOKED_AT - 1) for time in wanted if self.times} | {0}
             images = islice(decode(container, track, [], weave=True), max(positions) + 1)
             return [self._rgb(image, index) for index, image in enumerate(images) if index in positions]
 
-    def _glimpse(self, container: InputContainer, track: VideoStream, time: float) -> NDArray[np.uint8] | None:
+    def _image_near(self, container: InputContainer, track: VideoStream, time: float) -> NDArray[np.uint8] | None:
         """The image at a time since the first one; None if the file cannot be searched."""
         at, image = time + self.start, None
         try:

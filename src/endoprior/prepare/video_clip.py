@@ -25,7 +25,7 @@ from .config import Layout, PrepareConfig
 from .frame_geometry import MIN_SIDE_PX
 from .notes import ToDo
 from .source import ImageFolder, Source, open_source
-from .stereo_layout import GLIMPSES, camera_size, find_layout, split_cameras
+from .stereo_layout import NUM_SAMPLE_IMAGES, camera_size, find_layout, split_cameras
 from .video import SourceFrame, Video
 
 EVEN = 0.25  # a time step that differs from the nominal one by more than this share is uneven
@@ -197,7 +197,7 @@ class Clip:
         self.calibration, self._rescaled = _of_square_pixels(calibration, self.source)
         self.layout: Layout = cfg.layout
         if cfg.layout == "auto":
-            images = self.source.glimpses(cfg.start, cfg.end, GLIMPSES)
+            images = self.source.sample_images(cfg.start, cfg.end, NUM_SAMPLE_IMAGES)
             self.layout = find_layout(images, self.calibration, second is not None, str(video))
         if self.layout == "two-files" and second is None:
             raise input_error("--layout two-files", "a second video", "none", "`--right VIDEO`.")
