@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -54,6 +54,12 @@ class Score:
     """Name of the score in whose place it is printed when that one has no value; of scores outside of summaries."""
     in_true_mm: bool = False
     """Whether its length is measured in the ground truth, in mm also where the depth of the sequence is relative."""
+
+    def variant(self, end: str, label: str, of: str, *, in_summary: bool = False) -> Score:
+        """The same score `of` something else, such as "chained flow"; `end` and `label` are added to name and label."""
+        name, description = f"{self.name}_{end}", f"`{self.name}` of {of}."
+        full_label = f"{self.label}, {label}"
+        return replace(self, name=name, label=full_label, description=description, in_summary=in_summary, hint="")
 
     @property
     def is_length(self) -> bool:

@@ -57,30 +57,12 @@ TEXTS = {
     HIDDEN: ("hidden", "in frames that do not show them"),
 }
 OF_PARTS = tuple(
-    replace(
-        score,
-        name=f"{score.name}_{part}",
-        label=f"{score.label}, {short}",
-        description=f"`{score.name}` of points {where}.",
-        in_summary=score.name == "deformation_stretch" and part != HIDDEN,
-        hint="",
-    )
+    score.variant(part, short, f"points {where}", in_summary=score.name == "deformation_stretch" and part != HIDDEN)
     for score in OVER_ALL
     for part, (short, where) in TEXTS.items()
 )
 ERRORS = OVER_ALL + OF_PARTS
-OF_REFERENCES = tuple(
-    replace(
-        score,
-        name=f"{score.name}_{end}",
-        label=f"{score.label}, {short}",
-        description=f"`{score.name}` of {what}.",
-        in_summary=False,
-        hint="",
-    )
-    for score in ERRORS
-    for end, (short, what) in REFERENCES.items()
-)
+OF_REFERENCES = tuple(score.variant(end, short, what) for score in ERRORS for end, (short, what) in REFERENCES.items())
 SCORES = ERRORS + OF_REFERENCES
 NO_POINT = "no such point has a value"
 

@@ -36,23 +36,10 @@ SEEN = (
         compare="absolute", group="motion", in_summary=False,
     ),
 )  # fmt: skip
-HIDDEN = (
-    Score(
-        "range_held_95_hidden", "in 95 %, hidden", "", None, 3,
-        "The same of the 95 % range, where the frame does not show the point.",
-        compare="absolute", group="motion", hint="0.95: as said",
-    ),
-    Score(
-        "range_held_80_hidden", "in 80 %, hidden", "", None, 3,
-        "The same of the 80 % range, where the frame does not show the point.",
-        compare="absolute", group="motion", in_summary=False,
-    ),
-    Score(
-        "range_held_50_hidden", "in 50 %, hidden", "", None, 3,
-        "The same of the 50 % range, where the frame does not show the point.",
-        compare="absolute", group="motion", in_summary=False,
-    ),
-)  # fmt: skip
+HIDDEN = tuple(
+    score.variant("hidden", "hidden", "points that the frame does not show", in_summary=score.in_summary)
+    for score in SEEN
+)
 SCORES = SEEN + HIDDEN
 
 

@@ -122,16 +122,7 @@ BREAKS = (
 REFERENCES = {"dis": ("flow", "chained optical flow (DIS)"), "still": ("no motion", "no motion")}
 """What stands beside the scene's scores, by the end of the name."""
 OF_REFERENCES = tuple(
-    replace(
-        score,
-        name=f"{score.name}_{end}",
-        label=f"{score.label}, {short}",
-        description=f"`{score.name}` of {what}.",
-        in_summary=False,
-        hint="",
-    )
-    for score in ACCURACY
-    for end, (short, what) in REFERENCES.items()
+    score.variant(end, short, what) for score in ACCURACY for end, (short, what) in REFERENCES.items()
 )
 SCORES = END_ERROR + ACCURACY + BREAKS + OF_REFERENCES
 WHY_NOT = {
