@@ -2,7 +2,7 @@
 // points that Gaussians carry as in model/carry.py.
 
 const NUM_CARRIERS = 8;
-const LEAST_ALPHA = 0.5; // of the tissue at a pixel, to be measured
+const MIN_ALPHA = 0.5; // of the tissue at a pixel, to be measured
 const BLUR = 0.3; // px squared
 const ALPHA_MIN = 1 / 255;
 const [AT_QUAT, AT_SCALE, AT_OPACITY] = [3, 7, 10]; // positions among the channels
@@ -61,7 +61,7 @@ function surfacePoint(parts, view, pixel) {
     depth += left * alpha * z;
     left *= 1 - alpha;
   }
-  if (1 - left < LEAST_ALPHA) return null;
+  if (1 - left < MIN_ALPHA) return null;
   const z = depth / (1 - left);
   const inCamera = [...[0, 1].map((i) => ((pixel[i] - view.center[i]) / view.focal[i]) * z), z];
   const from = inCamera.map((v, i) => v - view.translation[i]);

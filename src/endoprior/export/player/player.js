@@ -1,7 +1,7 @@
 // The page: what is shown (one state), and the buttons, keys and hands that change it.
 
 const NEAR_Z = 0.2; // mm
-const MOST_PIXELS_PER_PIXEL = 2; // rendered per recorded one; more would add no detail
+const MAX_PIXELS_PER_PIXEL = 2; // rendered per recorded one; more would add no detail
 const LONGEST_STEP = 0.25; // s that playing may jump when the browser was busy
 const BUDGET = 60; // ms for an image in motion: fewer pixels if it takes longer, all of them once it is static
 const COARSEST = 0.25; // of the full width
@@ -51,7 +51,7 @@ function layOut(share) {
   const [w, h] = state.free ? [width, height] : [Math.round(about.width * scale), Math.round(about.height * scale)];
   const place = { width: w, height: h, left: Math.floor((width - w) / 2), top: Math.floor((height - h) / 2) };
   for (const [name, length] of Object.entries(place)) canvas.style[name] = ruler.style[name] = `${length}px`;
-  const density = share * Math.min(window.devicePixelRatio || 1, MOST_PIXELS_PER_PIXEL / scale);
+  const density = share * Math.min(window.devicePixelRatio || 1, MAX_PIXELS_PER_PIXEL / scale);
   const buffer = [w, h].map((length) => Math.max(1, Math.round(length * density)));
   if (canvas.width !== buffer[0]) canvas.width = buffer[0];
   if (canvas.height !== buffer[1]) canvas.height = buffer[1];
