@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
@@ -108,3 +109,16 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
     """Raise ValueError unless low <= value <= high (NaN fails)."""
     if not low <= value <= high:
         raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value!r}")
+
+
+def shipped_file(file: Path, sha256: str, what: str) -> bytes:
+    """The bytes of a file that comes with the program; InputError, which says `what` it is, if missing or changed."""
+    fix = "install the program again."
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise input_error(file, what, f"{error.strerror}", fix) from None
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != sha256:
+        raise input_error(file, f"a file with SHA-256 {sha256[:12]}...", f"{digest[:12]}...", fix)
+    return data

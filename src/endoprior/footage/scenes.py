@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .alignment import align
 from .components import Image, Mask
-from .keypoints import alike, keypoints
+from .keypoints import keypoints, match_descriptors
 from .optical_flow import follow_both_ways
 
 CORNERS, FEATURES = 200, 400  # most corners that are followed, and features that are compared, in an image
@@ -69,10 +69,10 @@ def flow_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
 
 def feature_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     """The common motion of features between any two images; None if too few are found again."""
-    (first, first_like), (second, second_like) = before.features, now.features
+    (first, first_descriptors), (second, second_descriptors) = before.features, now.features
     if min(len(first), len(second)) < MIN_MATCHES:
         return None
-    here, there = alike(first_like, second_like, DISTINCT)
+    here, there = match_descriptors(first_descriptors, second_descriptors, DISTINCT)
     return _link(first[here], second[there], len(here), LIKE_PX, now.gray.shape[1])
 
 

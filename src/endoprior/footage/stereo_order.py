@@ -19,7 +19,7 @@ from ..core.checks import check_shape
 from ..core.geometry import bilinear, pixel_centers, right_camera
 from ..core.types import Frame
 from .components import Image, Mask
-from .keypoints import alike, keypoints
+from .keypoints import keypoints, match_descriptors
 
 SMALL_STEP, LARGE_STEP = 16, 64
 """Penalty per block pixel for a disparity change of one px between neighbors, and for a larger change."""
@@ -123,10 +123,12 @@ def vertical_offset_px(left_u8: Image, right_u8: Image) -> float:
 
 def row_offsets_px(left_u8: Image, right_u8: Image) -> NDArray[np.float64]:
     """(N,) y_right - y_left of each matching feature, px; arguments as for `vertical_offset_px`."""
-    (left, left_like), (right, right_like) = (keypoints(camera, FEATURES) for camera in _gray(left_u8, right_u8))
+    (left, left_descriptors), (right, right_descriptors) = (
+        keypoints(camera, FEATURES) for camera in _gray(left_u8, right_u8)
+    )
     if min(len(left), len(right)) < MIN_MATCHES:
         return np.zeros(0)
-    of_left, of_right = alike(left_like, right_like, RATIO)
+    of_left, of_right = match_descriptors(left_descriptors, right_descriptors, RATIO)
     return right[of_right, 1].astype(np.float64) - left[of_left, 1]
 
 

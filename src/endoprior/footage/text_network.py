@@ -9,7 +9,6 @@ The weights are a file in the package, checked against its digest; docs/text_net
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import check_shape, input_error
+from ..core.checks import check_shape, shipped_file
 from .components import HEIGHT, LEFT, TOP, WIDTH, Image, components
 
 FILE = Path(__file__).with_name("text_network.onnx")
@@ -73,14 +72,7 @@ class TextDetector:
 
     def __init__(self) -> None:
         """Load the weights; InputError if the file is missing or changed."""
-        fix = "install the program again."
-        try:
-            data = FILE.read_bytes()
-        except OSError as error:
-            raise input_error(FILE, "the weights of the text detector", f"{error.strerror}", fix) from None
-        digest = hashlib.sha256(data).hexdigest()
-        if digest != SHA256:
-            raise input_error(FILE, f"a file with SHA-256 {SHA256[:12]}...", f"{digest[:12]}...", fix)
+        data = shipped_file(FILE, SHA256, "the weights of the text detector")
         self._network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
 
     def find(self, rgb_u8: Image, scale: float = 1.0) -> list[TextBox]:

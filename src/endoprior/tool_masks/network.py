@@ -8,7 +8,6 @@ the size of the whole image. The masks are a starting point: correct them in the
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -22,7 +21,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.checks import check_shape, input_error
+from ..core.checks import check_shape, shipped_file
 from ..data.found_tools import FoundTools
 from ..footage.components import Image, InOrder, Mask
 from .over_time import Look, decide_over_time
@@ -156,15 +155,7 @@ def network_input(rgb_u8: Image, view: Mask) -> NDArray[np.float32]:
 @cache
 def shipped_network() -> ToolNetwork:
     """The network that comes with the program, for inference only; InputError if the file is missing or changed."""
-    fix = "install the program again."
-    try:
-        data = FILE.read_bytes()
-    except OSError as error:
-        raise input_error(FILE, "the weights of the tool network", f"{error.strerror}", fix) from None
-    digest = hashlib.sha256(data).hexdigest()
-    if digest != SHA256:
-        raise input_error(FILE, f"a file with SHA-256 {SHA256[:12]}...", f"{digest[:12]}...", fix)
-    return network_from(data)
+    return network_from(shipped_file(FILE, SHA256, "the weights of the tool network"))
 
 
 def network_from(data: bytes) -> ToolNetwork:
