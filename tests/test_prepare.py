@@ -256,6 +256,9 @@ MONO = {"layout": "mono"}
 BAD = {
     "missing calibration key": lambda d, p: ({"right": p / "right", "calibration": without(d, p, "R")}, "no R"),
     "second camera missing": lambda d, p: ({"layout": "two-files"}, "--right"),
+    "a second file and two cameras in each frame": lambda d, p: (
+        {"right": p / "right", "layout": "side-by-side"}, "--layout: expected auto or two-files with --right",
+    ),
     "sgbm with one camera": lambda d, p: (MONO | {"depth": "sgbm"}, "expected two cameras"),
     "mask of another size": lambda d, p: (MONO | {"masks": str(smaller_masks(d, p))}, "px like the images"),
     "no mask folder": lambda d, p: (MONO | {"masks": "nowhere"}, "a folder of masks"),

@@ -25,7 +25,7 @@ from .config import Layout, PrepareConfig
 from .frame_geometry import MIN_SIDE_PX
 from .notes import ToDo
 from .source import ImageFolder, Source, open_source
-from .stereo_layout import NUM_SAMPLE_IMAGES, camera_size, find_layout, split_cameras
+from .stereo_layout import KINDS, NUM_SAMPLE_IMAGES, camera_size, find_layout, split_cameras
 from .video import SourceFrame, Video
 
 EVEN = 0.25  # a time step that differs from the nominal one by more than this share is uneven
@@ -196,6 +196,9 @@ class Clip:
             raise input_error(video, f"images of at least {MIN_SIDE_PX}x{MIN_SIDE_PX} px", got, "Give the full size.")
         self.calibration, self._rescaled = _of_square_pixels(calibration, self.source)
         self.layout: Layout = cfg.layout
+        if second is not None and cfg.layout in KINDS:
+            fix = "Remove one of both options."
+            raise input_error("--layout", "auto or two-files with --right", cfg.layout, fix)
         if cfg.layout == "auto":
             images = self.source.sample_images(cfg.start, cfg.end, NUM_SAMPLE_IMAGES)
             self.layout = find_layout(images, self.calibration, second is not None, str(video))
