@@ -72,6 +72,13 @@ def test_an_image_of_another_size_is_named(tmp_path):
         list(open_source(tmp_path))
 
 
+def test_an_image_of_16_bits_among_those_of_8_is_named(tmp_path):
+    for number, kind in enumerate((np.uint8, np.uint8, np.uint16)):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((24, 32, 3), 200, kind))
+    with pytest.raises(InputError, match=r"2\.png: expected 8 bits a channel like the first image, got 16"):
+        list(open_source(tmp_path))
+
+
 def taken(times, **options):
     selection = FrameSelection(**options)
     stereo_frames = list(selection.pick(SourceFrame(i, t, np.zeros((1, 1, 3), np.uint8)) for i, t in enumerate(times)))

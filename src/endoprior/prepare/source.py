@@ -49,7 +49,9 @@ class ImageFolder:
             raise input_error(path, WANTED, "none", "pass the folder that holds them.")
         self.times = [index / frames_per_second for index in range(len(self.files))]
         self.num_frames, self.seconds = len(self.files), len(self.files) / frames_per_second
-        self.height, self.width = self._stored(self.files[0]).shape[:2]
+        first = self._stored(self.files[0])
+        self.height, self.width = first.shape[:2]
+        self._is_deep = first.dtype == np.uint16
 
     @property
     def notes(self) -> list[str]:
@@ -85,6 +87,8 @@ class ImageFolder:
         if is_matte(stored[..., 3:]):
             self._transparent.add(index)
         if stored.dtype == np.uint16:
+            if not self._is_deep:
+                raise input_error(file, "8 bits a channel like the first image", "16", "Save it like the others.")
             stored = (stored >> (self._bits - 8)).astype(np.uint8)
         return SourceFrame(index, self.times[index], np.ascontiguousarray(stored[..., 2::-1]))
 
@@ -96,7 +100,7 @@ class ImageFolder:
     @cached_property
     def _bits(self) -> int:
         """Bits a channel that are in use, at least 8. Medical cameras write 10 or 12 bits into files of 16."""
-        if self._stored(self.files[0]).dtype == np.uint8:
+        if not self._is_deep:
             return 8
         largest = max(int(image[..., :3].max()) for image in map(self._stored, self.files) if image.dtype == np.uint16)
         return max(largest.bit_length(), 8)
