@@ -249,6 +249,7 @@ REJECTED = {
     "omni of Kalibr": ("c.yaml", kalibr("omni", [1.2]), "got omni"),
     "ds of Kalibr": ("c.yaml", kalibr("ds", [-0.2, 0.5]), "got ds"),
     "MEI": ("c.yaml", "%YAML:1.0\nmodel_type: MEI\nmirror_parameters:\n   xi: 1.2\n", "got MEI"),
+    "omni of OpenCV's sample": ("c.json", in_json(D=[0.1] * 4, xi=1.2), "omnidirectional"),
     "fov": ("cameras.txt", colmap("FOV", "1 2 3 4 5"), "got FOV"),
     "an unknown model": ("c.json", in_json(distortion_model="division2", D=[0.1] * 4), "got division2"),
     "which of two models": ("c.json", in_json(k1=1, k2=1, k3=1, k4=1), "the model of the distortion"),

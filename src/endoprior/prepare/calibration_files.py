@@ -282,16 +282,19 @@ def _is_fisheye(local: _Values) -> bool:
     def among(model: str, names: tuple[str, ...]) -> bool:
         return any(model == name or (len(name) > 4 and name in model) for name in names)
 
+    want = "a lens of OpenCV's usual model (plumb_bob, radtan, rational_polynomial) or a fisheye (equidistant)"
+    fix = "Undistort the video first, or calibrate with one of these."
     fisheye = any(plain(str(local.get(name))) in ("1", "10", "true", "yes") for name in FLAGS)
     for name in (*MODEL_NAMES, *LENS_NAMES):
         if not isinstance(words := local.get(name), str):
             continue
         model, is_fisheye = plain(words), among(plain(words), FISHEYES)
         is_unknown = name in MODEL_NAMES and not is_fisheye and model not in USUAL
-        if among(model, OTHERS) or "xi" in local or is_unknown:
-            want = "a lens of OpenCV's usual model (plumb_bob, radtan, rational_polynomial) or a fisheye (equidistant)"
-            raise local.error(want, words[:60], "Undistort the video first, or calibrate with one of these.")
+        if among(model, OTHERS) or is_unknown:
+            raise local.error(want, words[:60], fix)
         fisheye |= is_fisheye
+    if "xi" in local:
+        raise local.error(want, "xi, of an omnidirectional lens", fix)
     return fisheye
 
 
