@@ -12,7 +12,7 @@ from endoprior.data import load_sequence
 from endoprior.data.images import save_png
 from endoprior.footage.text_network import TextBox
 from endoprior.prepare import prepare
-from endoprior.prepare.burnt_in_text import BurntInText
+from endoprior.prepare.burnt_in_text import BurntInText, find_text
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.video_clip import StereoFrame
 
@@ -89,3 +89,17 @@ def test_both_cameras_are_painted_at_one_place():
     assert seen.left[20:].all() and white.all()
     other = StereoFrame(8, 0.0, white, None)
     assert text.painted(other) is other
+
+
+def test_a_label_that_is_not_found_again_gives_no_note(monkeypatch):
+    class OfSamples:
+        """Finds a label that moves in the samples, and nothing when all frames are searched."""
+
+        def find(self, image, scale=None):
+            at = float(image[0, 0, 0])
+            return [TextBox(0.95, at, at, 60.0, 10.0, 0.0)] if scale is None else []
+
+    monkeypatch.setattr("endoprior.prepare.burnt_in_text.TextDetector", OfSamples)
+    frames = [StereoFrame(k, k / 25, np.full((200, 200, 3), 40 + 20 * k, np.uint8), None) for k in range(6)]
+    found = find_text(frames, lambda: frames, range(6), np.ones((200, 200), bool))
+    assert not found.boxes and not found.notes

@@ -75,7 +75,8 @@ def find_text(
         moved = dict(zip(indices, follow(images, found.moving, detector.find), strict=True))
         for index, each in moved.items():
             boxes.setdefault(index, []).extend(each)
-        notes.append(_note("text that moves", {index: each[0] for index, each in moved.items() if each}, indices, view))
+        if first := {index: each[0] for index, each in moved.items() if each}:
+            notes.append(_note("text that moves", first, indices, view))
     more = [f"{len(notes) - MAX_NAMED} more texts"] if len(notes) > MAX_NAMED else []
     if notes:
         end = "It is masked, and black in the images. Look for text that was missed: `--blank X,Y,W,H` hides it"
