@@ -14,6 +14,7 @@ from endoprior.prepare.camera_path.adjust import (
     residuals,
     weights,
 )
+from endoprior.prepare.camera_path.breathing import separate
 from endoprior.prepare.camera_path.colmap import ray_points
 from endoprior.prepare.camera_path.follow import follow_camera
 
@@ -141,3 +142,16 @@ def test_rays_meet_in_their_points():
     found, spread = ray_points(tracks, poses, np.ones(8, bool))
     assert np.abs(found - world)[spread > 0.02].max() < 1e-3
     assert np.all(spread[np.bincount(np.concatenate(tracks.ids), minlength=tracks.count) < 2] == 0)
+
+
+def test_breathing_does_not_depend_on_depth_that_was_not_measured():
+    poses, world, seen = scene()
+    missing = np.arange(len(seen.camera)) % 5 < 3
+    sigma = np.stack([seen.sigma[:, 0], np.where(missing, np.inf, seen.sigma[:, 1])], 1)
+    results = [
+        separate(
+            OPENCV, *shaken(poses, world), replace(seen, sigma=sigma, inverse_depth=inverse), np.arange(len(poses)), 3.0
+        )
+        for inverse in (seen.inverse_depth, np.where(missing, 1.0, seen.inverse_depth))
+    ]
+    assert all(np.array_equal(*parts) for parts in zip(*results, strict=True))

@@ -153,7 +153,7 @@ def separate(
     poses, points = poses.copy(), points.copy()
     basis, wave = surface_basis(points), waves(frames, period)
     coefficients = np.zeros((basis.shape[1], wave.shape[1], 3))
-    distance = float(np.median(1 / seen.inverse_depth))
+    distance = float(np.median(1 / seen.inverse_depth[np.isfinite(seen.sigma[:, 1])]))
     track = np.ones(len(points))
     for _ in range(ROUNDS):
         swing = np.einsum("nb,nh->nbh", basis[seen.point], wave[seen.camera])
