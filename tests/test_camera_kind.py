@@ -13,9 +13,9 @@ from endoprior.footage.alignment import align, mean_shift
 from endoprior.footage.camera_motion import camera_motion
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.prepare.camera_path.features import followed, followed_directly, new_corners, tracking_frame
-from endoprior.prepare.camera_path.kind import path_motion
+from endoprior.prepare.camera_path.path import CameraPath, path_motion
 from endoprior.prepare.camera_path.sequence_path import path_depth, sequence_path
-from endoprior.prepare.camera_path.tracks import CameraPath, PoseInput, TrackingCamera, Tracks
+from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera, Tracks
 from endoprior.prepare.relative_depth import fit_shading
 
 SIZE = 320, 240

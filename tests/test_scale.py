@@ -33,7 +33,8 @@ from endoprior.data.scale import Scale
 from endoprior.data.scale_files import finish_scale, write_scale
 from endoprior.data.writer import FrameFiles, SequenceMeta, new_sequence
 from endoprior.prepare import prepare
-from endoprior.prepare.camera_path.tracks import CameraPath, PoseInput
+from endoprior.prepare.camera_path.path import CameraPath
+from endoprior.prepare.camera_path.tracks import PoseInput
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.folder_path import write_folder_path
 from endoprior.prepare.scale.find import use_scale

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from endoprior.prepare.camera_path import shape
-from endoprior.prepare.camera_path.path_facts import MAX_DEPTH_RATIO
-from endoprior.prepare.camera_path.shape import axial_cosine, shape_by_light
+from endoprior.prepare.camera_path.shape import MAX_DEPTH_RATIO, axial_cosine, shape_by_light
 from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
 from endoprior.prepare.relative_depth import fit_shading
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.description import ESTIMATED_POSES, PATH_RECORD, intrinsics_of, read_description
+from ..data.description import ESTIMATED_POSES, MOTION, PATH_RECORD, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
 from ..data.files import CONFIDENCE, list_files
 from ..data.frame_files import match_names
@@ -20,8 +20,9 @@ from ..data.scale import described_scale, without_scale
 from ..data.writer import POSES, demand_writable, depth_bounds, pose_table, replace_depth, replace_poses
 from ..footage.changes import find_changes
 from ..system.atomic import write_json
+from .camera_path.path import REFINED, CameraPath
 from .camera_path.sequence_path import AS_OURS, ASSUMED, Reading, path_depth, sequence_path
-from .camera_path.tracks import MOTION, REFINED, CameraPath, PoseInput, TrackingCamera
+from .camera_path.tracks import PoseInput, TrackingCamera
 
 STATIC = "static camera"
 DEPTH_OF_OLD_PATH = "depth was measured by parallax with the path before; `endoprior prepare` measures it anew"

@@ -29,8 +29,9 @@ from ..system.memory import BoundedCache, cache_bytes
 from ..system.parallel import frame_threads
 from .calibration import parse_size
 from .calibration_files import read_calibration
+from .camera_path.path import CameraPath
 from .camera_path.sequence_path import ASSUMED, CALIBRATED, Reading, path_depth, sequence_path
-from .camera_path.tracks import CameraPath, PoseInput, TrackingCamera
+from .camera_path.tracks import PoseInput, TrackingCamera
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows

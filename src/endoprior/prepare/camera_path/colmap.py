@@ -25,7 +25,8 @@ from .adjust import adjust, back_projected
 from .features import usable_tissue
 from .follow import Follower
 from .own import finished_path, place_frames
-from .tracks import CameraPath, PoseInput, Tracks
+from .path import CameraPath
+from .tracks import PoseInput, Tracks
 
 ENOUGH_IMAGES, MAX_STRIDE = 150, 4  # a longer clip is mapped by every second to fourth frame
 LONGEST = 1000  # longer clips are mapped only if COLMAP is asked for: it takes seconds a frame

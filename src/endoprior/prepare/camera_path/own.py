@@ -17,7 +17,8 @@ from .adjust import adjust, back_projected
 from .breathing import Breathing, separate_breathing
 from .features import Keyframe, match_keyframe
 from .follow import Follower, follow_camera
-from .tracks import CameraPath, PoseInput, TrackingCamera, Tracks
+from .path import CameraPath
+from .tracks import PoseInput, TrackingCamera, Tracks
 
 FOCAL_PRIOR = 0.2  # standard deviation of log f where the focal length is assumed
 FOCAL_STD = 0.03  # a refined focal length is kept if the standard deviation of its logarithm is below this

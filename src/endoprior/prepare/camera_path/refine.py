@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from .adjust import Adjusted, Observations, adjust, back_projected, residuals
 from .even_view import matrix_at
 from .matches import Matches, match_frames
-from .tracks import CameraPath, PoseInput, TrackingCamera
+from .path import CameraPath
+from .tracks import PoseInput, TrackingCamera
 
 MAX_WIDTH = 640  # frames are matched at this width at most, px
 PIXEL_STD = 0.3  # of a match, px of an image 640 px wide

@@ -26,12 +26,12 @@ from ...system.parallel import frame_threads
 from .adjust import Observations, adjust, back_projected, residuals
 from .colmap import LONGEST, colmap_path, is_installed, with_poses
 from .follow import Follower, follow_camera
-from .kind import path_motion
 from .own import own_path
+from .path import CameraPath, path_motion
 from .pose_file import MM_PER_M, is_model, is_text, read_model_poses, read_poses, read_text_poses
 from .refine import refined_path
 from .shape import DepthShape, axial_cosine, fitted_shape, shape_by_light
-from .tracks import DEPTH_STD, CameraPath, PoseInput, TrackingCamera, Tracks
+from .tracks import DEPTH_STD, PoseInput, TrackingCamera, Tracks
 
 BYTES_PER_PX = 60  # memory in which a thread compares two frames, bytes for each px
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
@@ -266,7 +266,7 @@ def _deeper(
     """The path and its tracks with relative depth in the shape of triangulated points, else of the light in a tube; as
     they are if neither gives one, or if fewer frames follow by light.
     """
-    shape = fitted_shape(path, follower, cosine) if path.motion and path.motion.drives else None
+    shape = fitted_shape(path.explained, follower, cosine) if path.motion and path.motion.drives else None
     if shape is None:
         posed = np.flatnonzero(path.explained)
         shape = shape_by_light((frame(int(posed[i])) for i in evenly_spaced(len(posed), LIT_FRAMES)), cosine)
@@ -275,7 +275,7 @@ def _deeper(
     new, tracks = path, follower
     for _ in range(SHAPINGS):
         new, tracks = followed(shape)
-        shape = fitted_shape(new, tracks, cosine, shape) or shape
+        shape = fitted_shape(new.explained, tracks, cosine, shape) or shape
     if not shape.pixels and new.explained.sum() < path.explained.sum():
         return path, follower
     return replace(new, shape=shape), tracks

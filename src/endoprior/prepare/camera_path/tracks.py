@@ -1,19 +1,15 @@
-"""What camera tracking reads, keeps and returns: frames, lens, tracks of points, path. `T` frames, `P` points."""
+"""What camera tracking reads and keeps: frames, camera, tracks of points. `T` frames, `P` points."""
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data.description import MOTION
 from .adjust import Observations, Resected, refined_pose
-from .path_facts import DepthShape, PathMotion
 
-REFINED = "refined with the camera path"  # where the focal length may come from: `sources.lens` of `sequence.json`
 HELD_OUT = 8  # one in this many tracks takes no part in any estimate: it measures how well a path explains the frames
 PIXEL_STD = 0.5  # error of a followed corner, px of an image 640 px wide
 KEYPOINT_STD = 1.0  # error of a matched keypoint, px of an image 640 px wide
@@ -58,59 +54,6 @@ class TrackingCamera:
     def px(self) -> float:
         """Length of a pixel of an image 640 px wide, in px of this one: thresholds are multiples of it."""
         return self.width / 640
-
-
-@dataclass(frozen=True)
-class CameraPath:
-    """Poses of all frames."""
-
-    camera_to_world: NDArray  # (T, 4, 4), translation in mm; an unexplained frame has the pose of the frame before it
-    explained: NDArray[np.bool_]  # (T,) whether the pose is linked to those of the other frames
-    depth_scale: NDArray  # (T,) factor that makes the depth of the frame agree with the path; 1 for depth in mm
-    method: str = "file"  # where the poses come from
-    focal_factor: float = 1.0  # refined focal length, as a multiple of the given one
-    translation_std: NDArray | None = None  # (T,) standard deviation of the camera center, mm; NaN where unexplained
-    rotation_std: NDArray | None = None  # (T,) standard deviation of the rotation, degrees
-    still: NDArray[np.bool_] | None = None  # (T,) whether the pose is a copy, because the camera rests
-    breathes: bool = False  # whether periodic motion of the tissue was told apart from the camera's
-    notes: list[str] = field(default_factory=list)  # notes for the user, one line each
-    motion: PathMotion | None = None  # how the camera moves along it; None without one
-    shape: DepthShape | None = None  # how the path changes the shape of relative depth, before its scale
-    is_unknown: bool = False  # whether the images do not say how the camera moves: one camera for the explained frames
-
-    @property
-    def lost(self) -> list[int]:
-        """Frames without a pose of their own."""
-        return np.flatnonzero(~self.explained).tolist()
-
-    def sources(self, old: dict[str, str]) -> dict[str, str]:
-        """`sources` of `sequence.json` with those of this path."""
-        kept = {name: text for name, text in old.items() if name != MOTION}
-        motion = {MOTION: self.kind} if self.kind else {}
-        return kept | {"poses": self.method} | motion | ({"lens": REFINED} if self.focal_factor != 1 else {})
-
-    @property
-    def kind(self) -> str:
-        """How the camera moves, in a word of `kind.Kind`; empty without one."""
-        return "unknown" if self.is_unknown else self.motion.kind if self.motion else ""
-
-    def record(self) -> dict[str, Any]:
-        """What `camera_path.json` holds."""
-
-        def numbers(values: NDArray | None) -> list[float | None]:
-            found = np.full(len(self.explained), np.nan) if values is None else values
-            return [round(float(v), 5) if np.isfinite(v) else None for v in found]
-
-        return {
-            "method": self.method,
-            "camera_motion": self.kind,
-            "focal_factor": round(self.focal_factor, 5),
-            "explained": self.explained.tolist(),
-            "still": [] if self.still is None else self.still.tolist(),
-            "translation_std_mm": numbers(self.translation_std),
-            "rotation_std_degrees": numbers(self.rotation_std),
-            "depth_scale": [round(float(v), 6) for v in self.depth_scale],
-        }
 
 
 class Tracks:

@@ -21,7 +21,8 @@ from ...data.scale import Scale, demand_plausible, demand_relative, described_sc
 from ...data.scale_files import finish_scale, scaled_record, write_scale
 from ...data.writer import FrameFiles, demand_writable
 from ...footage.border import find_outline, masked_border
-from ..camera_path.tracks import CameraPath, PoseInput
+from ..camera_path.path import CameraPath
+from ..camera_path.tracks import PoseInput
 from ..folder_path import of_all_images
 from .shaft import frontier, tip_readings
 
