@@ -20,12 +20,19 @@ from endoprior.data.pixels import measured_share
 from endoprior.initialization.sampling import GUESSED, pixel_probability
 from endoprior.model.presets import preset
 from endoprior.prepare import PrepareConfig, prepare
-from endoprior.prepare.camera_path.even_view import EvenView, Warp, matrix_at
-from endoprior.prepare.camera_path.partners import MAX_DEGREES, MIN_DEGREES, choose_partners, parallax
+from endoprior.prepare.camera_path.views import (
+    MAX_DEGREES,
+    MIN_DEGREES,
+    EvenView,
+    Warp,
+    choose_partners,
+    matrix_at,
+    parallax,
+    scaled_size,
+)
 from endoprior.prepare.frames import WORK
-from endoprior.prepare.parallax.correlation import correlation
-from endoprior.prepare.parallax.measure import bent, checked, measure_depth
-from endoprior.prepare.parallax.sweep import DIRECTIONS, aggregated, peak, scaled_size
+from endoprior.prepare.parallax import bent, checked, measure_depth
+from endoprior.prepare.plane_sweep import DIRECTIONS, aggregated, correlation, peak
 from endoprior.training.frames import TrainingFrames
 
 SIZE = (WIDTH, HEIGHT)

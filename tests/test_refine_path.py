@@ -10,9 +10,8 @@ import pytest
 from relief import HEIGHT, WIDTH, lens, path, pose, view
 
 from endoprior.prepare.camera_path import sequence_path as paths
-from endoprior.prepare.camera_path.matches import match_frames
 from endoprior.prepare.camera_path.path import CameraPath
-from endoprior.prepare.camera_path.refine import FITS_PX, refined_path
+from endoprior.prepare.camera_path.refine import FITS_PX, match_frames, refined_path
 
 SIZE, COUNT = (WIDTH, HEIGHT), 24
 RELATIVE = lens(relative=True)

@@ -37,7 +37,7 @@ from endoprior.prepare.camera_path.path import CameraPath
 from endoprior.prepare.camera_path.tracks import PoseInput
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.folder_path import write_folder_path
-from endoprior.prepare.scale.find import use_scale
+from endoprior.prepare.scale import use_scale
 from endoprior.view.panel import status
 from endoprior.view.server import Viewer
 from endoprior.view.viewable import ViewSettings

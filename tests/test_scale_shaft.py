@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endoprior.prepare.scale.shaft import TipReading, axis_of, frontier, ray_at, tip_readings
-from endoprior.prepare.scale.shaft_edges import line_through, shafts_of
+from endoprior.prepare.shaft import TipReading, axis_of, frontier, ray_at, tip_readings
+from endoprior.prepare.shaft_edges import line_through, shafts_of
 
 HEIGHT, WIDTH, RADIUS = 256, 320, 4.0
 MATRIX = np.array([[290.0, 0, 160.0], [0, 290.0, 128.0], [0, 0, 1]])

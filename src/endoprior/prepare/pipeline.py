@@ -38,8 +38,8 @@ from .frame_geometry import FrameGeometry, with_equal_rows
 from .frame_tools import FOUND, masked_frames
 from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
 from .notes import ToDo
-from .parallax.measure import measure_depth
-from .scale.find import check_scale_options, demand_no_unit, use_scale
+from .parallax import measure_depth
+from .scale import check_scale_options, demand_no_unit, use_scale
 from .source import ASSUMED_RATE
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder

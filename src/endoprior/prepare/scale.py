@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.checks import input_error
-from ...core.ranges import evenly_spaced
-from ...data import load_sequence
-from ...data.description import PATH_RECORD, read_description
-from ...data.images import read_depth
-from ...data.known_length import parse_known_length, scale_by_lengths
-from ...data.scale import Scale, demand_plausible, demand_relative, described_scale
-from ...data.scale_files import finish_scale, scaled_record, write_scale
-from ...data.writer import FrameFiles, demand_writable
-from ...footage.border import find_outline, masked_border
-from ..camera_path.path import CameraPath
-from ..camera_path.tracks import PoseInput
-from ..folder_path import of_all_images
+from ..core.checks import input_error
+from ..core.ranges import evenly_spaced
+from ..data import load_sequence
+from ..data.description import PATH_RECORD, read_description
+from ..data.images import read_depth
+from ..data.known_length import parse_known_length, scale_by_lengths
+from ..data.scale import Scale, demand_plausible, demand_relative, described_scale
+from ..data.scale_files import finish_scale, scaled_record, write_scale
+from ..data.writer import FrameFiles, demand_writable
+from ..footage.border import find_outline, masked_border
+from .camera_path.path import CameraPath
+from .camera_path.tracks import PoseInput
+from .folder_path import of_all_images
 from .shaft import frontier, tip_readings
 
 SHAFT_OPTION = "--shaft-mm"

@@ -20,13 +20,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.types import SURE_DEPTH
-from ...system.memory import BoundedCache, cache_bytes
-from ...system.parallel import frame_threads
-from ..camera_path.even_view import EvenView, Warp
-from ..camera_path.partners import choose_partners
-from ..camera_path.tracks import PoseInput
-from .sweep import FINE_WIDTH, Shot, Sweep, scaled_size
+from ..core.types import SURE_DEPTH
+from ..system.memory import BoundedCache, cache_bytes
+from ..system.parallel import frame_threads
+from .camera_path.tracks import PoseInput
+from .camera_path.views import EvenView, Warp, choose_partners, scaled_size
+from .plane_sweep import FINE_WIDTH, Shot, Sweep
 
 TOLERANCE = 0.02  # relative difference of two measured depths that halves their agreement
 MATCH_PX = 0.25  # standard deviation of a match, px of a fine view
@@ -34,97 +33,11 @@ NEEDED = 2.0  # agreement, summed over the partners, from which a depth is sure
 SUPPORT, SUPPORT_PX = 0.3, 5.0
 """Mean confidence of a neighborhood from which it supports a pixel, and its standard deviation, px of a fine view: what
 is sure alone among what is not has met its like by chance."""
-
-
-def checked(
-    inverse: NDArray[np.float32],
-    score: NDArray[np.float32],
-    warps: Sequence[Warp],
-    others: Sequence[NDArray[np.float32]],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(h, w) inverse depth, averaged with that of the partners that agree, and (h, w) confidence in [0, 1].
-
-    Confidence is the product of four terms: agreement, sum over the partners of 1 / (1 + (difference / 2 %)^2), of two
-    that are needed; precision, 1 / (1 + (error of a match / 2 %)^2) with the depth error that `MATCH_PX` makes; the
-    correlation of the images; and the support of the neighborhood.
-
-    Args:
-        inverse, score: (h, w) of the frame, see `Sweep.inverse_depth`.
-        warps, others: to each partner, and (h, w) its own inverse depth.
-    """
-    total, weight = inverse.copy(), np.ones_like(inverse)
-    agreement, precision = np.zeros_like(inverse), np.zeros_like(inverse)
-    for warp, other in zip(warps, others, strict=True):
-        x, y, expected = warp.at(inverse)
-        seen = cv2.remap(other, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        ratio = seen / np.maximum(expected, np.float32(1e-9))
-        agrees = np.where(seen > 0, 1 / (1 + ((ratio - 1) / TOLERANCE) ** 2), 0).astype(np.float32)
-        total += agrees * ratio * inverse
-        weight += agrees
-        agreement += agrees
-        nearer_x, nearer_y, _ = warp.at(inverse * np.float32(1 + TOLERANCE))
-        shift_px = np.hypot(nearer_x - x, nearer_y - y)
-        precision = np.maximum(precision, 1 / (1 + (MATCH_PX / np.maximum(shift_px, 1e-6)) ** 2))
-    sure = np.minimum(agreement / NEEDED, 1)
-    alone = (sure * precision * np.clip(score, 0, 1)).astype(np.float32)
-    support = np.minimum(cv2.GaussianBlur(alone, (0, 0), SUPPORT_PX) / np.float32(SUPPORT), 1)
-    return total / weight, alone * support
-
-
 REACHES = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48, 1 / 96)  # standard deviations, as shares of the width
 DOUBT = 0.05  # weight of no change beside that of pixels that are sure
 MIN_CONFIDENCE = 0.1  # confidence below which a pixel does not speak
 SAME = 0.1  # difference of log depth that halves the weight of another frame: beyond, it shows another surface
 MAX_GUESS_RATIO = 3.0  # of a measured depth to the guess, after one factor for the frame; above, a chance match
-
-
-def bent(
-    guess: NDArray[np.float32], inverse: NDArray[np.float32], confidence: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """(h, w) factor that brings a guessed depth to the measured one.
-
-    Args:
-        guess: (h, w) depth, 0 where it is missing. inverse: (h, w) measured inverse depth.
-        confidence: (h, w) of what was measured, in [0, 1].
-    """
-    weight = np.where((guess > 0) & (confidence > MIN_CONFIDENCE), confidence**2, 0).astype(np.float32)
-    left = -np.log(np.maximum(inverse * np.where(guess > 0, guess, 1), np.float32(1e-6))).astype(np.float32)
-    field = np.full_like(left, _median(left, weight))
-    left = np.clip(left - field, -np.log(MAX_GUESS_RATIO), np.log(MAX_GUESS_RATIO)).astype(np.float32)
-    for reach in REACHES:
-        sigma = reach * guess.shape[1]
-        spread = cv2.GaussianBlur(left * weight, (0, 0), sigma) / (cv2.GaussianBlur(weight, (0, 0), sigma) + DOUBT)
-        field, left = field + spread, left - spread
-    return np.exp(field)
-
-
-def steady(
-    depth: NDArray[np.float32], warps: Sequence[Warp], others: Sequence[NDArray[np.float32]]
-) -> NDArray[np.float32]:
-    """(h, w) depth of a frame, averaged with what frames around it have there: noise of single frames would shake it.
-
-    Args:
-        depth: (h, w), 0 where it is missing. warps, others: to each frame around it, and (h, w) its depth.
-    """
-    inverse = np.reciprocal(np.maximum(depth, np.float32(1e-6)))
-    total, weight = np.zeros_like(depth), np.ones_like(depth)
-    for warp, other in zip(warps, others, strict=True):
-        x, y, expected = warp.at(inverse)
-        seen = cv2.remap(other, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        change = np.log(np.maximum(seen * expected, np.float32(1e-6)))
-        agrees = np.where(seen > 0, 1 / (1 + (change / np.float32(SAME)) ** 2), 0)
-        total += agrees * change
-        weight += agrees
-    return depth * np.exp(total / weight)
-
-
-def _median(values: NDArray, weight: NDArray) -> float:
-    """Weighted median; 0 without any weight."""
-    order = np.argsort(values, axis=None)
-    share = np.cumsum(weight.ravel()[order], dtype=np.float64)
-    return float(values.flat[order[np.searchsorted(share, share[-1] / 2)]]) if share[-1] > 0 else 0.0
-
-
 MIN_MEASURED_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
 MIN_FRAME_SHARE = 0.5  # share of the frames that have partners, below which the camera moves too little
 BYTES_PER_PX = 400  # memory in which a thread measures a frame, bytes for each px of a fine view
@@ -261,3 +174,85 @@ def _guessed(seen: PoseInput, size: tuple[int, int]) -> tuple[NDArray[np.float32
     middle = float(np.median(seen.depth[there])) if there.any() else np.nan
     guess = np.asarray(cv2.resize(seen.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
     return guess, middle, float(seen.tissue_mask.mean()) * size[0] * size[1]
+
+
+def checked(
+    inverse: NDArray[np.float32],
+    score: NDArray[np.float32],
+    warps: Sequence[Warp],
+    others: Sequence[NDArray[np.float32]],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(h, w) inverse depth, averaged with that of the partners that agree, and (h, w) confidence in [0, 1].
+
+    Confidence is the product of four terms: agreement, sum over the partners of 1 / (1 + (difference / 2 %)^2), of two
+    that are needed; precision, 1 / (1 + (error of a match / 2 %)^2) with the depth error that `MATCH_PX` makes; the
+    correlation of the images; and the support of the neighborhood.
+
+    Args:
+        inverse, score: (h, w) of the frame, see `Sweep.inverse_depth`.
+        warps, others: to each partner, and (h, w) its own inverse depth.
+    """
+    total, weight = inverse.copy(), np.ones_like(inverse)
+    agreement, precision = np.zeros_like(inverse), np.zeros_like(inverse)
+    for warp, other in zip(warps, others, strict=True):
+        x, y, expected = warp.at(inverse)
+        seen = cv2.remap(other, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        ratio = seen / np.maximum(expected, np.float32(1e-9))
+        agrees = np.where(seen > 0, 1 / (1 + ((ratio - 1) / TOLERANCE) ** 2), 0).astype(np.float32)
+        total += agrees * ratio * inverse
+        weight += agrees
+        agreement += agrees
+        nearer_x, nearer_y, _ = warp.at(inverse * np.float32(1 + TOLERANCE))
+        shift_px = np.hypot(nearer_x - x, nearer_y - y)
+        precision = np.maximum(precision, 1 / (1 + (MATCH_PX / np.maximum(shift_px, 1e-6)) ** 2))
+    sure = np.minimum(agreement / NEEDED, 1)
+    alone = (sure * precision * np.clip(score, 0, 1)).astype(np.float32)
+    support = np.minimum(cv2.GaussianBlur(alone, (0, 0), SUPPORT_PX) / np.float32(SUPPORT), 1)
+    return total / weight, alone * support
+
+
+def bent(
+    guess: NDArray[np.float32], inverse: NDArray[np.float32], confidence: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """(h, w) factor that brings a guessed depth to the measured one.
+
+    Args:
+        guess: (h, w) depth, 0 where it is missing. inverse: (h, w) measured inverse depth.
+        confidence: (h, w) of what was measured, in [0, 1].
+    """
+    weight = np.where((guess > 0) & (confidence > MIN_CONFIDENCE), confidence**2, 0).astype(np.float32)
+    left = -np.log(np.maximum(inverse * np.where(guess > 0, guess, 1), np.float32(1e-6))).astype(np.float32)
+    field = np.full_like(left, _median(left, weight))
+    left = np.clip(left - field, -np.log(MAX_GUESS_RATIO), np.log(MAX_GUESS_RATIO)).astype(np.float32)
+    for reach in REACHES:
+        sigma = reach * guess.shape[1]
+        spread = cv2.GaussianBlur(left * weight, (0, 0), sigma) / (cv2.GaussianBlur(weight, (0, 0), sigma) + DOUBT)
+        field, left = field + spread, left - spread
+    return np.exp(field)
+
+
+def steady(
+    depth: NDArray[np.float32], warps: Sequence[Warp], others: Sequence[NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """(h, w) depth of a frame, averaged with what frames around it have there: noise of single frames would shake it.
+
+    Args:
+        depth: (h, w), 0 where it is missing. warps, others: to each frame around it, and (h, w) its depth.
+    """
+    inverse = np.reciprocal(np.maximum(depth, np.float32(1e-6)))
+    total, weight = np.zeros_like(depth), np.ones_like(depth)
+    for warp, other in zip(warps, others, strict=True):
+        x, y, expected = warp.at(inverse)
+        seen = cv2.remap(other, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        change = np.log(np.maximum(seen * expected, np.float32(1e-6)))
+        agrees = np.where(seen > 0, 1 / (1 + (change / np.float32(SAME)) ** 2), 0)
+        total += agrees * change
+        weight += agrees
+    return depth * np.exp(total / weight)
+
+
+def _median(values: NDArray, weight: NDArray) -> float:
+    """Weighted median; 0 without any weight."""
+    order = np.argsort(values, axis=None)
+    share = np.cumsum(weight.ravel()[order], dtype=np.float64)
+    return float(values.flat[order[np.searchsorted(share, share[-1] / 2)]]) if share[-1] > 0 else 0.0
