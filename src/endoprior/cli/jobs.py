@@ -7,8 +7,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..prepare.notes import asks_for_action
-from ..system.console import say
+from ..system.console import asks_for_action, say
 from .paths import require_writable_folder
 from .progress import Counting, duration, step_head, step_progress
 

@@ -12,8 +12,7 @@ from ..core.checks import check_range, number_ranges
 from ..core.geometry import Convention
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
-from ..prepare.notes import note_line
-from ..system.console import say
+from ..system.console import note_line, say
 from .arguments import Command
 from .paths import require_input_first
 from .progress import Counting

@@ -39,7 +39,6 @@ from ..footage.known_facts import KnownFacts
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
-from ..prepare.notes import note_line
 from ..prepare.pipeline import Progress
 from ..prepare.scan_figure import draw_scan
 from ..runs.folder import CHECKPOINT, CONFIG
@@ -47,6 +46,7 @@ from ..runs.log import mask_facts, missed_tools_of
 from ..runs.report import write_report
 from ..runs.train import TrainingRun, WindowedRun, start_run
 from ..system.atomic import write_json
+from ..system.console import note_line
 from ..system.parallel import Pool, frame_threads
 from ..training.trainer import StepReport, Trainer
 from ..visualization.image_tools import colorize, label, tile

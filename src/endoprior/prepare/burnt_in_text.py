@@ -16,7 +16,7 @@ import numpy as np
 from ..footage.components import Image, Mask
 from ..footage.text_network import TextBox, TextDetector
 from ..footage.texts import confirm, follow, rectangle, text_mask
-from .notes import ToDo
+from ..system.console import ToDo
 from .video_clip import StereoFrame
 
 MAX_NAMED = 5  # texts that notes name; more are counted

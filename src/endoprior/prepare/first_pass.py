@@ -19,12 +19,12 @@ from ..footage.border import Circle, Outside, Strips, find_outline, hidden_by_mo
 from ..footage.components import dilated, square
 from ..footage.overlays import find_strokes, without_strokes
 from ..footage.round_border import CERTAIN
+from ..system.console import ToDo
 from ..system.memory import cache_bytes
 from .burnt_in_text import BurntInText, find_text
 from .calibration import fitted
 from .config import Layout, PrepareConfig, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
-from .notes import ToDo
 from .source import ImageFolder
 from .video_clip import Clip, FrameSelection, StereoFrame
 

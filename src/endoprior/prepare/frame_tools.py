@@ -15,10 +15,10 @@ from ..data.mask_files import tool_polarity
 from ..data.mask_folders import open_mask_folder
 from ..data.writer import found_source
 from ..system.atomic import whole_file
+from ..system.console import ToDo
 from ..system.parallel import frame_threads
 from .config import PrepareConfig, is_sam2
 from .first_pass import FirstPass, Image, Mask, MeasuredFrame
-from .notes import ToDo
 
 BYTES_PER_PIXEL = 200  # of the source: memory that a thread needs to measure a frame, bytes
 COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete

@@ -27,12 +27,12 @@ from ..data.writer import TOOL_VALUE, FrameFiles, found_source, write_mask
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.depth_unit import guess_unit
 from ..footage.stereo_order import stereo_order, vertical_offset_px
+from ..system.console import ToDo
 from ..system.parallel import Pool, frame_threads
 from .config import NETWORK, PrepareConfig
 from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
 from .frame_tools import BYTES_PER_PIXEL, HINT, Tools, choose_tools
-from .notes import ToDo
 from .relative_depth import RelativeScale, fit_shading
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame

@@ -25,6 +25,7 @@ from ..data.load import not_to_prepare
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
 from ..footage.known_facts import KnownFacts
+from ..system.console import ToDo
 from ..system.memory import BoundedCache, cache_bytes
 from ..system.parallel import frame_threads
 from .calibration import parse_size
@@ -37,7 +38,6 @@ from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
 from .frame_tools import FOUND, masked_frames
 from .frames import WORK, FrameMethods, choose_methods, replace_by_carried, write_frames
-from .notes import ToDo
 from .parallax import measure_depth
 from .scale import check_scale_options, demand_no_unit, use_scale
 from .source import ASSUMED_RATE

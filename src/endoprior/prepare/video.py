@@ -26,8 +26,8 @@ from ..data.images import MIRRORED, TURNED, upright
 from ..data.pixels import is_matte
 from ..data.reading import MAX_PIXELS
 from ..data.video_files import open_container, starts_of_parts, what_it_is
+from ..system.console import ToDo
 from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, in_seconds, is_cover, packet_times, usual_rate
-from .notes import ToDo
 
 LOST_SHARE, LOST_IMAGES = 0.02, 2  # truncated: more of the duration, and more images, are missing at the end
 STATES_END = ("matroska,webm", "nut")

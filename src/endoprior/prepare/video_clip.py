@@ -20,10 +20,10 @@ from ..core.checks import input_error
 from ..core.shell import quoted
 from ..data.frame_files import match_names
 from ..footage.interlacing import Interlacing
+from ..system.console import ToDo
 from .calibration import Calibration
 from .config import Layout, PrepareConfig
 from .frame_geometry import MIN_SIDE_PX
-from .notes import ToDo
 from .source import ImageFolder, Source, open_source
 from .stereo_layout import KINDS, NUM_SAMPLE_IMAGES, camera_size, find_layout, split_cameras
 from .video import SourceFrame, Video

@@ -1,4 +1,7 @@
-"""Printing lines for the user. All text that the program prints goes through here, and is made printable."""
+"""Printing lines for the user. All text that the program prints goes through here, and is made printable.
+
+Notes are such lines: most say what was decided, some ask the user for an action.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,10 @@ import sys
 from contextlib import suppress
 
 from ..core.checks import input_error, printable
+
+INFORMS = "note: "
+"""What begins the line of a note that asks for no action."""
+ASKS = "to do: "
 
 
 def say(text: str) -> None:
@@ -34,3 +41,19 @@ def complete_streams() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # in this order: the lowest number is free
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
+
+
+class ToDo(str):
+    """A note that asks the user for an action."""
+
+    __slots__ = ()
+
+
+def note_line(note: str) -> str:
+    """The line that says a note."""
+    return f"{ASKS if isinstance(note, ToDo) else INFORMS}{note}"
+
+
+def asks_for_action(line: str) -> bool:
+    """Whether a line of a step is to be read: a result, a warning, or a note that asks for an action."""
+    return not line.startswith(INFORMS)
