@@ -23,9 +23,8 @@ from ..core.config import Config
 from ..core.config_deformation import DeformationConfig, HexPlaneConfig
 from .gaussians import Gaussians, offset_widths
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
-from .motion import Field, Motion
+from .motion import Field, ModelOps, Motion
 from .offsets import Offsets
-from .ops_interface import ModelOps
 
 
 class HexPlaneField(Field):

@@ -8,7 +8,8 @@ are added to the raw parameters: centers (mm), log scales, quaternions before no
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -19,7 +20,21 @@ from ..system.arrays_file import ArraySpec
 from .gaussians import Gaussians, attribute_shapes
 from .hexplane import PlaneGrid
 from .offsets import Offsets
-from .ops_interface import ModelOps
+
+
+@dataclass(frozen=True)
+class ModelOps:
+    """The operations that motions are computed by; `ops.py` has their two implementations."""
+
+    name: str
+    weighted_sum: Callable[..., Tensor]
+    """Offsets from temporal coefficients: see `basis.weighted_sum`."""
+    weighted_sum_backward: Callable[..., Tensor]
+    """Its gradient: see `basis.weighted_sum_backward`."""
+    hexplane_linear: Callable[..., tuple[Tensor, ...]]
+    """A linear layer on HexPlane features: see `hexplane.hexplane_linear`."""
+    fuse_heads: bool
+    """Compute the hidden layers of all heads as one matrix product: fewer and larger launches on a GPU."""
 
 
 class Field(ABC):

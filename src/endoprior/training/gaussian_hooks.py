@@ -24,7 +24,7 @@ from .density_stats import DensityStats
 from .frames import TrainingFrames
 from .losses import supervised_terms
 from .method import Method
-from .ops_interface import TrainingOps
+from .ops import TrainingOps
 from .optimizer import Rate, rate_of
 from .state import Drawn
 from .trainer import Stage
@@ -80,7 +80,7 @@ class GaussianHooks(Method):
 
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         """The weighted terms of the loss, () each."""
-        return supervised_terms(drawn.out, drawn.frame, cfg.loss, ops)
+        return supervised_terms(drawn.out, drawn.frame, cfg.loss, ops.supervised_losses)
 
     def density_due(self, stage: Stage, iteration: int, last: bool, cfg: Config) -> bool:
         """Whether Gaussians are cloned, split and removed after this iteration; `last`: of the stage."""

@@ -36,8 +36,7 @@ from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .gaussian_hooks import GaussianHooks
 from .missed_tools import VISITS, MaskDoubt
-from .ops import ops_for
-from .ops_interface import TrainingOps
+from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
 from .photometric import ClearedFrames, smoke_of
 from .state import GaussiansState

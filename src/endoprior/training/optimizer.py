@@ -18,7 +18,7 @@ from ..model.offsets import RankOneGradient, UnstoredGradient
 from ..system.arrays_file import part
 from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import MAX_GRADIENT
-from .ops_interface import TrainingOps
+from .ops import TrainingOps
 
 Rate = Callable[[int], float]  # learning rate at an iteration (1-based, within the stage)
 PLANES = "planes"  # name of the planes of a field, among the names of parameters

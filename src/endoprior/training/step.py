@@ -26,7 +26,7 @@ from .frames import TrainingFrames
 from .gaussian_hooks import GaussianHooks
 from .losses import color_l1
 from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
-from .ops_interface import TrainingOps
+from .ops import TrainingOps
 from .state import Before, Drawn, GaussiansState
 from .temporal import temporal_terms
 from .trainer import Stage, StepReport, stage_length
