@@ -20,6 +20,7 @@ from ..core.checks import InputError
 from ..core.config import Config
 from ..core.config_deformation import DeformationConfig
 from ..core.types import Splats
+from ..render.sh import C0
 from .offsets import Gradient, Offsets
 
 
@@ -102,7 +103,7 @@ def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-SH_C0 = 0.28209479177387814
+SH_C0 = C0
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
 

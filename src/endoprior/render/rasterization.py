@@ -226,14 +226,13 @@ def _demand_one_type(splats: Splats, background: Tensor) -> None:
 def _project_reference(camera: Camera, opacities: Tensor, *gaussians: Tensor) -> Tensors:
     means, quats, scales, coefficients, slopes = gaussians
     seen = project(Splats(means, quats, scales, opacities, coefficients, slopes), camera)
-    assert seen.det is not None
     shape = torch.cat([seen.cov2d, seen.det[:, None]], -1)
     return seen.means2d, shape, seen.z, seen.colors, seen.color_slopes2d, seen.radii
 
 
 def _composite_reference(size: tuple[int, int], radii: Tensor, background: Tensor, *gaussians: Tensor) -> Tensors:
     means2d, shape, z, colors, slopes, opacities = gaussians
-    seen = Projected(means2d, shape[:, :3], z, colors, slopes, radii, shape[:, 3])
+    seen = Projected(means2d, shape[:, :3], shape[:, 3], z, colors, slopes, radii)
     return composite(seen, opacities, size, background)
 
 
