@@ -94,7 +94,7 @@ class RenderedScene(ABC):
         """(I, J, 2) gain and veil of the smoke that the endoscope sees at a time: see `photometric`; None: none."""
         return None
 
-    def filmed(self, time: float, camera: Camera | None = None) -> RenderedView:
+    def render_with_smoke(self, time: float, camera: Camera | None = None) -> RenderedView:
         """`render` with the smoke of that time, as frames show it."""
         return behind_smoke(self.render(time, camera), self.smoke_at(time))
 

@@ -18,7 +18,7 @@ from ..core.config import Config
 from ..core.types import Camera
 from ..model.hexplane_field import HexPlaneField
 from ..model.motion import Motion
-from ..model.photometric import filmed
+from ..model.photometric import add_smoke
 from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
@@ -140,7 +140,7 @@ class TrainingStep:
         out = render(splats)
         out.means2d.retain_grad()  # density control grows where this gradient is large
         if self.smoke is not None:
-            out = replace(out, color=filmed(out.color, self.smoke[position]))
+            out = replace(out, color=add_smoke(out.color, self.smoke[position]))
         compared, left_out = frame, None
         if self.doubt and fine and not is_right and self._knows_tissue(state):
             compared = self.doubt.counted(frame, out.color)
