@@ -136,12 +136,12 @@ def rasterize(
     colors = colors.expand(len(cameras), *colors.shape[-2 if sh_degree is None else -3 :])
     steps = _steps(backend or ("numba" if means.device.type == "cpu" else "triton"))
     seen = []
-    for camera, view, given in zip(cameras, viewmats, colors, strict=True):
-        coefficients = means.new_zeros(len(means), 1, 3) if sh_degree is None else given
+    for camera, view, own_colors in zip(cameras, viewmats, colors, strict=True):
+        coefficients = means.new_zeros(len(means), 1, 3) if sh_degree is None else own_colors
         splats = Splats(means, quats, scales, _not_beyond(far_plane, means, opacities, view), coefficients)
         steps.demand(splats, backgrounds)
         found = _project(steps, splats, camera, view, scale)
-        seen.append(found if sh_degree is not None else found._replace(colors=given))
+        seen.append(found if sh_degree is not None else found._replace(colors=own_colors))
     means2d = torch.stack([each.means2d for each in seen])  # images are made of it: its gradient can be kept
     images, alphas = [], []
     for each, centers, background in zip(seen, means2d, backgrounds, strict=True):
