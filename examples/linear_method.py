@@ -3,9 +3,8 @@
 from torch import Tensor
 
 from endoprior.core.config import Config
-from endoprior.model.gaussians import Gaussians
+from endoprior.model.gaussians import Gaussians, Offsets
 from endoprior.model.motion import Field, ModelOps, Motion
-from endoprior.model.offsets import Offsets
 from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod
 from endoprior.training.ops import TrainingOps

@@ -19,7 +19,7 @@ from endoprior.data.window_plan import Looks, look_through, plan_windows
 from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.colors import with_fixed_color
-from endoprior.model.offsets import Offsets
+from endoprior.model.gaussians import Offsets
 from endoprior.model.playback import Playback
 from endoprior.model.presets import preset
 from endoprior.model.scene import SingleScene, faded, faded_in, joined

@@ -27,9 +27,8 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Frame, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
-from endoprior.model.gaussians import Gaussians
+from endoprior.model.gaussians import Gaussians, Offsets
 from endoprior.model.motion import Field, ModelOps, Motion
-from endoprior.model.offsets import Offsets
 from endoprior.render.projection import rotation_matrices
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan

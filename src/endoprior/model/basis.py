@@ -32,9 +32,8 @@ from ..compute.simd import LANES, prefetch
 from ..core.checks import check_shape
 from ..core.config import Config
 from ..core.config_deformation import DEGREE, BasisConfig
-from .gaussians import Gaussians, change_layout, temporal_shapes
+from .gaussians import Gaussians, Gradient, Offsets, RankOneGradient, change_layout, temporal_shapes
 from .motion import Field, ModelOps, Motion
-from .offsets import Gradient, Offsets, RankOneGradient
 
 TRAINED, GIVEN = ("motion", "changes"), ("frame_motion",)
 """Tensors of `temporal_shapes` that gradients train, as outer products; and those that optical flow gives."""

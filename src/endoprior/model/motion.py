@@ -1,4 +1,4 @@
-"""How Gaussians move: what is trained for it, and the offsets (`offsets.py`) that follow from it at a time.
+"""How Gaussians move: what is trained for it, and the `Offsets` that follow from it at a time.
 
 Two ways to hold motion, and a method may use both: tensors of each Gaussian, which follow it when it is cloned, split
 or removed (`basis.py` has ours); and a `Field` that all Gaussians share (`hexplane_field.py` has the paper's). Offsets
@@ -17,9 +17,8 @@ from torch import Tensor
 from ..core.config import Config
 from ..core.config_deformation import HexPlaneConfig
 from ..system.arrays_file import ArraySpec
-from .gaussians import Gaussians, attribute_shapes
+from .gaussians import Gaussians, Offsets, attribute_shapes
 from .hexplane import PlaneGrid
-from .offsets import Offsets
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,9 @@ from ..core.config import Config
 from ..core.geometry import share_of_right
 from ..core.types import Camera, RenderedView, Splats
 from ..system.arrays_file import part, save_arrays
-from .gaussians import Gaussians
+from .gaussians import Gaussians, Offsets
 from .method import SceneKind, method_of
 from .motion import Field, Motion
-from .offsets import Offsets
 from .ops import ops_for
 from .photometric import between, is_possible
 from .rendered_scene import RenderedScene, check_camera, no_gaussians

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from ..core.config import Config, OptimConfig
 from ..model.basis import GIVEN, TRAINED
-from ..model.gaussians import ATTRIBUTES, Gaussians, change_layout
+from ..model.gaussians import ATTRIBUTES, Gaussians, RankOneGradient, UnstoredGradient, change_layout
 from ..model.motion import Field
-from ..model.offsets import RankOneGradient, UnstoredGradient
 from ..system.arrays_file import part
 from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import MAX_GRADIENT
