@@ -106,7 +106,8 @@ class RenderedScene(ABC):
 
     def camera_at(self, time: float) -> Camera:
         """Camera of the frame nearest in time."""
-        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
+        nearest = round(time * len(self.cameras))
+        return self.cameras[min(max(nearest, 0), len(self.cameras) - 1)]
 
 
 def no_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> InputError:

@@ -171,9 +171,9 @@ def _reject(options: dict[str, Any], render_mode: str, near_plane: float, far_pl
             names = (*ONLY, *FREE, "near_plane", "far_plane", "sh_degree", "backgrounds", "render_mode", "backend")
             fix = or_did_you_mean("leave it out.", name, names)
             raise input_error(name, "an option of `rasterize`", "none of its options", fix)
-        is_tensor = isinstance(value, Tensor)
-        if is_tensor or value != ONLY[name]:
-            got = "a tensor" if is_tensor else repr(value)
+        array = "a tensor" if isinstance(value, Tensor) else "an array" if isinstance(value, np.ndarray) else ""
+        if array or value != ONLY[name]:
+            got = array or repr(value)
             fix = "leave it out; `gsplat.rasterization` has it, on an NVIDIA GPU."
             raise input_error(name, f"{ONLY[name]!r}, as nothing else is supported", got, fix)
     if render_mode not in get_args(RenderMode):
