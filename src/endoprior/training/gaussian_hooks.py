@@ -39,7 +39,7 @@ class GaussianHooks(Method):
     """
 
     uses_prior = True  # the texture prior of the frames is computed, for density control and the temporal term
-    keeps_optimizer = False  # adam's moments and steps go on from the coarse to the fine stage
+    keeps_optimizer = False  # Adam's moments and steps go on from the coarse to the fine stage
     starts_from_flow = False  # its Gaussians can start with the motion that optical flow finds: `init.motion flow`.
     color_is_error = False
     """Its term `color` is the mean absolute error over tissue; else the divergence check has that computed."""
