@@ -13,9 +13,8 @@ import torch
 from endoprior.compute.relu_network import relu_network, relu_network_torch
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.model.basis import TRAINED, basis_offsets
-from endoprior.model.gaussians import temporal_shapes
+from endoprior.model.gaussians import RankOneGradient, temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField
-from endoprior.model.offsets import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps

@@ -104,7 +104,9 @@ def torch_compositing(
     seen, opacities = project(splats, camera), splats.opacities.clone().requires_grad_()
     bins = plain.bin_tiles(seen, opacities, camera.width, camera.height)
     inputs = [t.clone().requires_grad_() for t in (seen.means2d, seen.cov2d, seen.z, seen.colors)]
-    given, background = Projected(*inputs, seen.color_slopes2d, seen.radii), torch.zeros(3)
+    means2d, cov2d, z, colors = inputs
+    given = Projected(means2d, cov2d, seen.det, z, colors, seen.color_slopes2d, seen.radii)
+    background = torch.zeros(3)
     return {
         "forward": lambda _: plain.composite(given, opacities, bins, background, camera.width, camera.height),
         "backward": lambda out: torch.autograd.grad(out, [*inputs, opacities], [v_color, v_alpha, v_depth]),

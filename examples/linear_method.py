@@ -3,13 +3,11 @@
 from torch import Tensor
 
 from endoprior.core.config import Config
-from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Field, Motion
-from endoprior.model.offsets import Offsets
-from endoprior.model.ops_interface import ModelOps
+from endoprior.model.gaussians import Gaussians, Offsets
+from endoprior.model.motion import Field, ModelOps, Motion
 from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod
-from endoprior.training.ops_interface import TrainingOps
+from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate
 from endoprior.training.state import Drawn
 

@@ -8,7 +8,7 @@ from torch.nn.functional import avg_pool2d
 
 from endoprior.core.config import Config
 from endoprior.core.ranges import Range
-from endoprior.training.ops_interface import TrainingOps
+from endoprior.training.ops import TrainingOps
 from endoprior.training.own_method import OwnMethod
 from endoprior.training.state import Drawn
 

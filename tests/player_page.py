@@ -150,4 +150,4 @@ def rendered(scene: Scene, time: float) -> NDArray[np.float64]:
     """(H, W, 3) the renderer's picture, 0..255."""
     # Where two windows show, the page has the Gaussians of both, and `Scene.render` mixes their pictures.
     parts, camera = [(scene.at(time), 1.0)], scene.camera_at(time)
-    return 255.0 * scenes.rendered(parts, camera, scene.backend, scene.background).color.numpy()
+    return 255.0 * scenes.render_parts(parts, camera, scene.backend, scene.background).color.numpy()

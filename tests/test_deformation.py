@@ -19,9 +19,8 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig
 from endoprior.model.basis import basis_offsets, basis_weights, frame_weights, spline_weights
-from endoprior.model.gaussians import change_layout, temporal_shapes
+from endoprior.model.gaussians import Offsets, change_layout, temporal_shapes
 from endoprior.model.hexplane_field import HexPlaneField, OffsetHeads, box_of_points, head_shapes
-from endoprior.model.offsets import Offsets
 from endoprior.model.ops import NUMBA
 
 SMALL = DeformationConfig(kind="hexplane", hexplane=planes((6, 5, 4), 8, 12, (1, 2)), max_scale_change=0.0)

@@ -31,7 +31,7 @@ from endoprior import evaluate, load_scene, load_sequence
 from endoprior_studies.results import Results
 from endoprior_studies.spec import Cell, MethodSpec, SequenceSpec, Spec
 from endoprior_studies.tables import markdown, score_table
-from endoprior.model.offsets import Offsets
+from endoprior.model.gaussians import Offsets
 
 
 class Static:

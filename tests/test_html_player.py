@@ -26,7 +26,7 @@ from player_page import (
 
 from endoprior.core.checks import InputError
 from endoprior.export.html import write_html
-from endoprior.model.photometric import GRID, filmed_torch
+from endoprior.model.photometric import GRID, add_smoke_torch
 from endoprior.model.scene import Scene
 from endoprior.render import sh
 
@@ -155,7 +155,7 @@ def test_smoke_is_shown_when_asked_for_and_where_there_is_some(scene, page, tmp_
     press_button(page, "#smoke")
     settle(page)
     with torch.no_grad():
-        want = 255 * filmed_torch(torch.from_numpy(rendered(scene, 4 / NUM_FRAMES) / 255), grids[4]).numpy()
+        want = 255 * add_smoke_torch(torch.from_numpy(rendered(scene, 4 / NUM_FRAMES) / 255), grids[4]).numpy()
     got = picture(page, kept / "smoke.png")
     print(f"smoke: {np.abs(want - tissue).mean():.1f} levels, off by {np.abs(got - want).mean():.3f}")
     assert np.abs(want - tissue).mean() > 20 and np.abs(got - want).mean() < 0.9

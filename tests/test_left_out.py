@@ -15,7 +15,13 @@ from endoprior.runs.folder import CONFIG, LOG, check_state, load_checkpoint, sav
 from endoprior.runs.log import missed_tools_line, missed_tools_of
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.missed_tools import MIN_MISSED_TOOL_SHARE, VISITS, MaskDoubt, missed_tool_frames, record_visit
+from endoprior.training.missed_tools import (
+    MIN_MISSED_TOOL_SHARE,
+    VISITS,
+    MissedToolFinder,
+    missed_tool_frames,
+    record_visit,
+)
 
 MISSED = 4
 
@@ -45,7 +51,7 @@ def sequence(make_tiny_sequence, monkeypatch):
         keep[: len(keep) // 5] = frame.index != MISSED
         return replace(frame, tissue_mask=frame.tissue_mask & keep) if frame.index == MISSED else frame
 
-    monkeypatch.setattr(MaskDoubt, "counted", counted)
+    monkeypatch.setattr(MissedToolFinder, "without_tools", counted)
     return load_sequence(folder)
 
 
@@ -104,11 +110,11 @@ def test_windows_count_from_the_start_of_the_sequence(tmp_path):
 
 def test_the_share_is_of_the_view(sequence):
     frame = GaussianTrainer(sequence, CFG).step_once.frames.frame(0)
-    doubt = MaskDoubt(sequence)
+    finder = MissedToolFinder(sequence)
     half = torch.zeros_like(frame.tissue_mask)
     half[: len(half) // 2] = True
     counted = replace(frame, tissue_mask=frame.tissue_mask & ~half)
     lost = int((frame.tissue_mask & half).sum())
-    assert doubt.share(frame, frame) == 0
+    assert finder.share(frame, frame) == 0
     # The whole image is the view: nothing is black or masked in all frames.
-    assert doubt.share(frame, counted) == pytest.approx(lost / half.numel()) and lost
+    assert finder.share(frame, counted) == pytest.approx(lost / half.numel()) and lost

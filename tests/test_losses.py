@@ -10,7 +10,6 @@ from endoprior.core.types import RenderOutput
 from endoprior.training import losses
 from endoprior.training.losses import supervised_losses_numba as supervised_losses
 from endoprior.training.losses import supervised_terms
-from endoprior.training.ops import NUMBA
 
 
 def scene(seed: int, height: int = 13, width: int = 17):
@@ -153,8 +152,8 @@ def test_holes_cost_only_where_tissue_is_hidden():
         counted_depth=measured,
     )
     out = RenderOutput(color, alpha, depth, torch.zeros(0, 2), torch.zeros(0))
-    assert "cover" not in supervised_terms(out, frame, LossConfig(cover_weight=0.0), NUMBA)
-    term = supervised_terms(out, frame, LossConfig(cover_weight=0.5), NUMBA)["cover"]
+    assert "cover" not in supervised_terms(out, frame, LossConfig(cover_weight=0.0), supervised_losses)
+    term = supervised_terms(out, frame, LossConfig(cover_weight=0.5), supervised_losses)["cover"]
     assert term.item() == pytest.approx(0.5 * (1 - alpha[hidden]).sum().item() / alpha.numel(), rel=1e-5)
     term.backward()
     assert (alpha.grad[hidden] < 0).all() and not alpha.grad[~hidden].any()

@@ -17,7 +17,7 @@ from endoprior.data.images import read_tool_mask, save_png
 from endoprior.data.writer import note_found_masks
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.missed_tools import MaskDoubt, missed_tools
+from endoprior.training.missed_tools import MissedToolFinder, missed_tools
 
 VIEW = np.ones((128, 160), bool)
 NOWHERE = np.zeros_like(VIEW)
@@ -103,33 +103,35 @@ def test_pixels_of_a_missed_tool_do_not_count(phantom):
     tool = torch.from_numpy(read_tool_mask(phantom[0] / "masks" / "000003.png"))
     assert frame.index == 3 and tool.any()
     color = torch.where(tool[..., None], torch.tensor([0.5, 0.2, 0.2]), frame.rgb)
-    counted = MaskDoubt(sequence).counted(frame, color)
+    counted = MissedToolFinder(sequence).without_tools(frame, color)
     missed = frame.tissue_mask & ~counted.tissue_mask
     assert (missed & tool).sum() > 0.5 * tool.sum() and (missed & ~tool).sum() < 0.6 * tool.sum()
     assert counted.num_measured == counted.measured.sum() < frame.num_measured
-    assert MaskDoubt(sequence).counted(frame, frame.rgb) is frame
+    assert MissedToolFinder(sequence).without_tools(frame, frame.rgb) is frame
 
 
 def test_frames_of_half_and_full_resolution_share_what_is_surely_tissue(make_tiny_sequence):
     data = make_tiny_sequence(num_frames=3, width=328, height=213)  # 104 and 103 rows of 160 px
     sequence = load_sequence(data).training_view()
-    frames, doubt = GaussianTrainer(sequence, tiny_config("basis")).step_once.frames, MaskDoubt(sequence)
+    frames, finder = GaussianTrainer(sequence, tiny_config("basis")).step_once.frames, MissedToolFinder(sequence)
     for half in (True, False):
         frame = frames.frame(0, half=half)
-        assert doubt.counted(frame, frame.rgb) is frame
+        assert finder.without_tools(frame, frame.rgb) is frame
 
 
-@pytest.mark.parametrize(("which", "trust", "doubts"), [(1, False, True), (1, True, False), (0, False, False)])
-def test_only_found_masks_that_are_not_trusted_are_doubted(phantom, which, trust, doubts):
+@pytest.mark.parametrize(("which", "trust", "finds"), [(1, False, True), (1, True, False), (0, False, False)])
+def test_only_found_masks_that_are_not_trusted_are_searched(phantom, which, trust, finds):
     cfg = tiny_config("basis").replace({"trust_masks": trust})
     trainer = GaussianTrainer(load_sequence(Path(phantom[which])), cfg)
-    assert (trainer.step_once.doubt is not None) == doubts
+    assert (trainer.step_once.missed_tools is not None) == finds
     assert from_dict(type(cfg), to_dict(cfg)).loss.trust_masks == trust
 
 
-def test_doubt_begins_when_the_scene_explains_resting_tissue(phantom, monkeypatch):
+def test_the_search_begins_when_the_scene_explains_resting_tissue(phantom, monkeypatch):
     calls = []
-    monkeypatch.setattr(MaskDoubt, "counted", lambda self, frame, color: calls.append(color.shape) or frame)
+    monkeypatch.setattr(
+        MissedToolFinder, "without_tools", lambda self, frame, color: calls.append(color.shape) or frame
+    )
     cfg = tiny_config("basis", coarse=2, fine=20).replace({"trust_masks": False})
     trainer = GaussianTrainer(load_sequence(phantom[1]).training_view(), cfg)
     trainer.start()
@@ -138,7 +140,7 @@ def test_doubt_begins_when_the_scene_explains_resting_tissue(phantom, monkeypatc
     longer = GaussianTrainer(trainer.sequence, cfg.extended(1000))  # a tenth of it is not done yet
     state = trainer.state
     arrays = state.arrays()
-    for shown, more in ((0.0, 0), (0.1, 1)):  # once masks were in doubt, they stay so when the run is extended
+    for shown, more in ((0.0, 0), (0.1, 1)):  # once begun, it goes on when the run is extended
         shares = torch.full_like(arrays["left_out"], shown)
         longer.restore(state.stage, state.iteration, arrays | {"left_out": shares})
         calls.clear()

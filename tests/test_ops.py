@@ -13,7 +13,7 @@ from tiny_training import tiny_config
 
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
-from endoprior.model.offsets import RankOneGradient
+from endoprior.model.gaussians import RankOneGradient
 from endoprior.model.scene_file import load_scene
 from endoprior.training.adam import AdamState
 from endoprior.training.density import DensityStats

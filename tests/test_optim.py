@@ -9,9 +9,8 @@ import torch
 
 from endoprior.core.config import OptimConfig
 from endoprior.initialization.first_gaussians import create_gaussians
-from endoprior.model.gaussians import change_layout
+from endoprior.model.gaussians import RankOneGradient, change_layout
 from endoprior.model.method import method_of
-from endoprior.model.offsets import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA

@@ -15,7 +15,7 @@ from tiny_training import losses_of, tiny_config
 from endoprior import evaluate, load_scene, load_sequence, train
 from endoprior.cli import main
 from endoprior.core.checks import InputError
-from endoprior.model.photometric import GRID, between, filmed, filmed_torch, of_all_frames
+from endoprior.model.photometric import GRID, add_smoke, add_smoke_torch, between, of_all_frames
 from endoprior.model.windowed_scene import Span, WindowedScene
 from endoprior.runs.train import start_run
 from endoprior.training.photometric import fitted_grids, looks_of, of_pixels, resized, smoke_needed, smoke_of
@@ -68,30 +68,37 @@ def random_case(seed: int = 0, dtype=torch.float32):
 def test_the_kernel_and_the_formula_agree_in_value_and_gradient():
     (color, grid), weight = random_case(), torch.rand(37, 45, 3)
     found = {}
-    for function in (filmed, filmed_torch):
+    for function in (add_smoke, add_smoke_torch):
         shown = function(color, grid)
         (slope,) = torch.autograd.grad((shown * weight).sum(), color)
         found[function] = shown.detach(), slope
-    torch.testing.assert_close(found[filmed], found[filmed_torch], rtol=2e-5, atol=2e-5)
+    torch.testing.assert_close(found[add_smoke], found[add_smoke_torch], rtol=2e-5, atol=2e-5)
+
+
+def test_a_second_backward_pass_gives_the_gradient_again():
+    color, grid = random_case()
+    total = add_smoke(color, grid).sum() * 3
+    first, second = (torch.autograd.grad(total, color, retain_graph=True)[0].clone() for _ in range(2))
+    assert torch.equal(first, second)
 
 
 def test_gradient_against_finite_differences():
     color, grid = random_case(1, torch.float64)
     small = color[:5, :6].detach().clamp(min=0.05).requires_grad_()
-    assert torch.autograd.gradcheck(lambda c: filmed(c, grid), small)
+    assert torch.autograd.gradcheck(lambda c: add_smoke(c, grid), small)
 
 
 def test_no_smoke_changes_nothing():
     color, grid = random_case()
     grid[..., 0], grid[..., 1] = 1, 0
-    torch.testing.assert_close(filmed(color, grid), color, rtol=1e-3, atol=1.01e-4)
+    torch.testing.assert_close(add_smoke(color, grid), color, rtol=1e-3, atol=1.01e-4)
 
 
 def test_smoke_in_closed_form_at_the_centers_of_cells():
     grid = torch.rand(*GRID, 2)
     color = torch.full((GRID[0] * 3, GRID[1] * 3, 3), 0.5)  # the middle of three pixels is the center of a cell
     want = (grid[..., 0] * 0.25 + grid[..., 1]).sqrt()
-    torch.testing.assert_close(filmed(color, grid)[1::3, 1::3, 0], want, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(add_smoke(color, grid)[1::3, 1::3, 0], want, rtol=1e-4, atol=1e-4)
 
 
 def test_held_out_frames_lie_between_their_neighbors():
@@ -185,7 +192,9 @@ def test_the_scene_shows_tissue_and_frames_apart_and_scores_take_the_latter(run,
     scene, sequence = load_scene(run), load_sequence(smoky[0])
     assert scene.smoke.shape == (17, *GRID, 2)
     frame = sequence.frame(9)  # held out, behind smoke
-    tissue, shown = (function(frame.time, frame.camera).color.numpy() for function in (scene.render, scene.filmed))
+    tissue, shown = (
+        function(frame.time, frame.camera).color.numpy() for function in (scene.render, scene.render_with_smoke)
+    )
     assert np.abs(tissue - shown).mean() > 0.05
     assert psnr(tissue, smoky[1][9], frame.tissue_mask) > psnr(shown, smoky[1][9], frame.tissue_mask)
     scored = evaluate(scene, sequence, networks=False)
@@ -222,7 +231,7 @@ def test_the_viewer_shows_tissue_and_smoke_when_asked(run):
     viewable, camera = ViewableScene(scene, "run"), scene.cameras[9]
     assert viewable.has_smoke
     pictures = [viewable.picture(ViewSettings(frame=9, smoke=smoke), camera) for smoke in (False, True)]
-    for picture, view in zip(pictures, (scene.render(9 / 17), scene.filmed(9 / 17)), strict=True):
+    for picture, view in zip(pictures, (scene.render(9 / 17), scene.render_with_smoke(9 / 17)), strict=True):
         assert np.abs(picture / 255 - view.color.numpy()).max() < 0.003
     aside = ViewSettings(frame=9, smoke=True, endoscope=False)
     assert np.array_equal(viewable.picture(aside, camera), pictures[0])  # smoke is known in the endoscope's view only

@@ -222,7 +222,7 @@ def test_what_steps_hand_on_changes_no_result(video, done, tmp_path, monkeypatch
     for step in STEPS:
         if step.name == "video":
             assert handed_on.rendered is not None
-            monkeypatch.setattr(SingleScene, "filmed", lambda *_: rendered.append(1))
+            monkeypatch.setattr(SingleScene, "render_with_smoke", lambda *_: rendered.append(1))
         if step.name == "player":
             monkeypatch.undo()
         run_step(step, job, quiet, handed_on)

@@ -94,6 +94,13 @@ def test_the_frame_not_drawn_for_longest_goes_first(scene, monkeypatch):
     assert pictures_equal(tight.render(1), scene.render(1 / NUM_FRAMES))
 
 
+def test_the_camera_of_the_nearest_frame(scene):
+    cameras = tuple(replace(scene.cameras[0], cx=30.0 + i) for i in range(NUM_FRAMES))
+    numbered = replace(scene, cameras=cameras)
+    nearest = [numbered.camera_at(time).cx - 30 for time in (-0.3, 0.0, 0.29, 0.31, 1.0, 1.2)]
+    assert nearest == [0, 0, 1, 2, NUM_FRAMES - 1, NUM_FRAMES - 1]
+
+
 def test_another_camera_and_no_such_frame(scene):
     playback = Playback(scene)
     wide = replace(scene.cameras[0], width=80, cx=40.0)

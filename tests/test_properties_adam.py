@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.model.offsets import RankOneGradient
+from endoprior.model.gaussians import RankOneGradient
 from endoprior.training.adam import BETA1, BETA2, AdamState
 from endoprior.training.ops import NUMBA
 

@@ -8,12 +8,18 @@ import pytest
 import torch
 
 from endoprior.compute.frequency_encoding import encoded, encoded_size
-from endoprior_radiance import endosurf_networks
+from endoprior_radiance import endosurf
 from endoprior_radiance import presets as presets_radiance
 from endoprior_radiance.endonerf import CanonicalNetwork, EndoNeRF, TimeNetwork
-from endoprior_radiance.endosurf import EndoSurf, rounds_of
-from endoprior_radiance.endosurf_networks import ColorNetwork, DeformationNetwork, SurfaceNetwork
-from endoprior_radiance.layers import Linear, NormedLinear, encoded_change, start
+from endoprior_radiance.endosurf import (
+    ColorNetwork,
+    DeformationNetwork,
+    EndoSurf,
+    SurfaceNetwork,
+    encoded_change,
+    rounds_of,
+)
+from endoprior_radiance.layers import Linear, NormedLinear, start
 from endoprior_radiance.presets import RadianceConfig
 
 
@@ -98,7 +104,7 @@ def test_surface_starts_as_a_sphere(seed: int):
     x = torch.nn.functional.normalize(torch.randn(400, 3, generator=rng), dim=-1) * torch.rand(400, 1, generator=rng)
     with torch.no_grad():
         distance, features = network(x)
-    error = distance - (x.norm(dim=-1) - endosurf_networks.SPHERE)
+    error = distance - (x.norm(dim=-1) - endosurf.SPHERE)
     assert features.shape == (400, 256)
     assert float(error.abs().mean()) < 0.15  # the network is random: a sphere up to some percent
     assert bool((distance[x.norm(dim=-1) < 0.3] < 0).all())

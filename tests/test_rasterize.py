@@ -261,6 +261,7 @@ def test_the_example_of_the_page_runs(capsys):
         ({"packed": True}, "packed: expected False"),
         ({"eps2d": 0.1}, "eps2d: expected 0.3"),
         ({"covars": torch.zeros(1)}, "covars: expected None, as nothing else is supported, got a tensor. Fix: Leave"),
+        ({"radial_coeffs": np.zeros(4)}, "radial_coeffs: expected None, as nothing else is supported, got an array."),
         ({"render_mod": "RGB"}, "Did you mean `render_mode`?"),
         ({"render_mode": "RGBD"}, "render_mode: expected one of RGB, D, ED, RGB+D, RGB+ED, got 'RGBD'"),
         ({"backend": "gsplat"}, "backend: expected one of reference, numba, triton, got 'gsplat'"),

@@ -17,13 +17,12 @@ from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence, window_plan
 from endoprior.data.window_plan import Looks, look_through, plan_windows
 from endoprior.initialization.first_gaussians import create_gaussians
-from endoprior.model.blending import faded, joined
 from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.colors import with_fixed_color
-from endoprior.model.offsets import Offsets
+from endoprior.model.gaussians import Offsets
 from endoprior.model.playback import Playback
 from endoprior.model.presets import preset
-from endoprior.model.scene import SingleScene, faded_in
+from endoprior.model.scene import SingleScene, faded, faded_in, joined
 from endoprior.model.scene_file import load_scene
 from endoprior.model.surface import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file

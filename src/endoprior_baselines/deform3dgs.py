@@ -23,10 +23,8 @@ from endoprior.core.ranges import Range
 from endoprior.core.types import Frame
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.initialization.sampling import PointCloud, concatenated, has_surface
-from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Field, Motion
-from endoprior.model.offsets import Offsets
-from endoprior.model.ops_interface import ModelOps
+from endoprior.model.gaussians import Gaussians, Offsets
+from endoprior.model.motion import Field, ModelOps, Motion
 from endoprior.training.optimizer import Rate, rate_of
 
 from .learned_basis import COEFFICIENTS, value_at

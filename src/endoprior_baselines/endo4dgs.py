@@ -24,7 +24,7 @@ from endoprior.render.projection import rotation_matrices
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
-from endoprior.training.ops_interface import TrainingOps
+from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate, rate_of
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage

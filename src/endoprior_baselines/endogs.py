@@ -21,16 +21,14 @@ from typing_extensions import override
 from endoprior.compute.relu_network import relu_network
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import DeformationConfig
-from endoprior.model.gaussians import Gaussians
+from endoprior.model.gaussians import Gaussians, Offsets
 from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion, LinearLayers, num_features
-from endoprior.model.motion import Field
-from endoprior.model.offsets import Offsets
-from endoprior.model.ops_interface import ModelOps
+from endoprior.model.motion import Field, ModelOps
 from endoprior.training.density import CLONE_EXTENT, MAX_GAUSSIANS, DensityStats, Plan
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
-from endoprior.training.ops_interface import TrainingOps
+from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage

@@ -39,7 +39,7 @@ from endoprior.compute.simd import (
     store_some,
     where_ge,
 )
-from endoprior.model.offsets import RankOneGradient, UnstoredGradient
+from endoprior.model.gaussians import RankOneGradient, UnstoredGradient
 
 COEFFICIENTS = ("basis_weights", "basis_centers", "basis_widths")
 """Names of the tensors w, c, s of the Gaussians, (N, B, C) each."""

@@ -27,16 +27,14 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Frame, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
-from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Field, Motion
-from endoprior.model.offsets import Offsets
-from endoprior.model.ops_interface import ModelOps
+from endoprior.model.gaussians import Gaussians, Offsets
+from endoprior.model.motion import Field, ModelOps, Motion
 from endoprior.render.projection import rotation_matrices
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan
 from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
-from endoprior.training.ops_interface import TrainingOps
+from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_linear, rate_of
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage

@@ -13,16 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Generator, Tensor
-from torch.nn.functional import normalize
+from torch import Generator, Tensor, nn
+from torch.nn.functional import linear, normalize, softplus
 from typing_extensions import override
 
+from endoprior.compute.frequency_encoding import encoded, encoded_size
 from endoprior.compute.neighbors import nearest
 from endoprior.compute.relu_network import BLOCK_ROWS
 from endoprior.core.geometry import back_project, pixel_centers
 
-from .endosurf_networks import SHARPNESS, ColorNetwork, DeformationNetwork, SurfaceNetwork
 from .field import RadianceField, RayBatch, uniform
+from .layers import NormedLinear, layers_of, start
 from .presets import RadianceConfig
 from .rays import (
     Composited,
@@ -46,7 +47,8 @@ BESIDE = 0.1
 WARM_UP, LAST_RATE, ANNEALED = 0.05, 0.05, 0.5
 """Share of the schedule over which the rate rises, the factor it then falls to, and the share that anneals alpha."""
 
-COLOR, DEPTH, SURFACE, ANGLE, EIKONAL, NEIGHBOR = 1.0, 1.0, 1.0, 0.1, 0.1, 0.1
+COLOR_WEIGHT, DEPTH_WEIGHT, SURFACE_WEIGHT = 1.0, 1.0, 1.0
+ANGLE_WEIGHT, EIKONAL_WEIGHT, NEIGHBOR_WEIGHT = 0.1, 0.1, 0.1
 """Weights of the terms."""
 EIKONAL_WITHIN = 1.2
 """Samples within this radius count for the length of the gradient."""
@@ -62,6 +64,132 @@ NEIGHBORS, SPREAD = 5, 20.0
 """A point stays if this many others lie within so many times the mean distance to the nearest one."""
 FILLED = 0.8
 """Distance of the farthest point from the center, as a share of the radius."""
+
+
+DEFORMED, TIME, SURFACE, COLORED, DIRECTION = 6, 6, 6, 10, 4
+"""Frequencies: position and time of the deformation, position of the distance, position and direction of the color."""
+LAYERS, WIDTH, SKIP = 9, 256, 4
+"""Layers of each network, their width, and the one that gets the input again."""
+SPHERE = 0.8
+"""Radius of the sphere that the surface starts as; the scene has radius 1."""
+SHARPNESS = 0.3
+"""First value of the parameter whose exponential, times 10, is the sharpness."""
+
+
+def encoded_change(x: Tensor, dx: Tensor, num: int) -> Tensor:
+    """How `encoded(x)` changes when x changes along `dx` (..., D): its directional derivative."""
+    parts = [dx]
+    for k in range(num):
+        angle, rate = x * 2.0**k, dx * 2.0**k
+        parts += [torch.cos(angle) * rate, -torch.sin(angle) * rate]
+    return torch.cat(parts, -1)
+
+
+class SkipNetwork(nn.Module):
+    """Nine layers, the fifth of which gets the input again."""
+
+    activation = staticmethod(torch.relu)
+
+    def __init__(self, inputs: list[int], outputs: list[int]) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(map(NormedLinear, inputs, outputs))
+
+    def start(self, generator: Generator) -> None:
+        """First values: torch's usual ones."""
+        start(self, generator)
+
+    def through(self, inputs: Tensor) -> Tensor:
+        """The last layer's outputs (P, outputs) of inputs (P, inputs)."""
+        hidden = inputs
+        for k, layer in enumerate(layers_of(self, NormedLinear)):
+            hidden = layer(_with_input(k, hidden, inputs))
+            if k < LAYERS - 1:
+                hidden = self.activation(hidden)
+        return hidden
+
+
+def _with_input(k: int, hidden: Tensor, inputs: Tensor) -> Tensor:
+    return torch.cat([hidden, inputs], -1) / math.sqrt(2) if k == SKIP else hidden
+
+
+def _sizes(inputs: int, outputs: int) -> tuple[list[int], list[int]]:
+    into = [inputs] + [WIDTH + (inputs if k == SKIP else 0) for k in range(1, LAYERS)]
+    return into, [WIDTH] * (LAYERS - 1) + [outputs]
+
+
+class DeformationNetwork(SkipNetwork):
+    """Displacement of a point from its time to the canonical space. The layer before the skip makes room for it."""
+
+    def __init__(self) -> None:
+        inputs = encoded_size(3, DEFORMED) + encoded_size(1, TIME)
+        out = [WIDTH - inputs if k + 1 == SKIP else WIDTH for k in range(LAYERS - 1)] + [3]
+        super().__init__([inputs] + [WIDTH] * (LAYERS - 1), out)
+
+    def forward(self, points: Tensor, time: float) -> Tensor:
+        """(P, 3) displacements of points (P, 3) at `time` in [0, 1]."""
+        return self.through(torch.cat([encoded(points, DEFORMED), self._at(time, points)], -1))
+
+    def with_change(self, points: Tensor, time: float, along: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacements (P, 3), and how they change when the points move along `along` (P, 3): J along.
+
+        The change runs through the layers beside the value: one pass instead of three backward ones for the whole J.
+        """
+        at_time = self._at(time, points)
+        inputs = hidden = torch.cat([encoded(points, DEFORMED), at_time], -1)
+        first = change = torch.cat([encoded_change(points, along, DEFORMED), torch.zeros_like(at_time)], -1)
+        for k, layer in enumerate(layers_of(self, NormedLinear)):
+            weight = layer.weight
+            hidden = linear(_with_input(k, hidden, inputs), weight, layer.bias)
+            change = linear(_with_input(k, change, first), weight)
+            if k < LAYERS - 1:
+                change = change * (hidden > 0)
+                hidden = torch.relu(hidden)
+        return hidden, change
+
+    @staticmethod
+    def _at(time: float, points: Tensor) -> Tensor:
+        return encoded(points.new_tensor([[time]]), TIME).expand(len(points), -1)
+
+
+class SurfaceNetwork(SkipNetwork):
+    """Signed distance to the canonical surface, positive on the camera's side, and features for the color."""
+
+    def __init__(self) -> None:
+        super().__init__(*_sizes(encoded_size(3, SURFACE), 1 + WIDTH))
+
+    @staticmethod
+    def activation(hidden: Tensor) -> Tensor:
+        """Smooth, so that the distance has a gradient everywhere."""
+        return softplus(hidden, beta=100)
+
+    @torch.no_grad()
+    def start(self, generator: Generator) -> None:
+        """First values that make the distance about |x| - `SPHERE` (geometric initialization of Atzmon and Lipman)."""
+        for k, layer in enumerate(layers_of(self, NormedLinear)):
+            rows, last = layer.direction, k == LAYERS - 1
+            mean, spread = (math.sqrt(math.pi / layer.inputs), 1e-4) if last else (0.0, math.sqrt(2 / layer.outputs))
+            rows.normal_(mean, spread, generator=generator)
+            layer.bias.fill_(-SPHERE if last else 0.0)
+            if k in (0, SKIP):  # of the encoding only the position itself counts at first
+                rows[:, layer.inputs - encoded_size(3, SURFACE) + 3 :] = 0
+            layer.measure()
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance (P,) and features (P, 256) at canonical points (P, 3)."""
+        values = self.through(encoded(points, SURFACE))
+        return values[:, 0], values[:, 1:]
+
+
+class ColorNetwork(SkipNetwork):
+    """Color of a canonical point, seen from a canonical direction."""
+
+    def __init__(self) -> None:
+        super().__init__(*_sizes(encoded_size(3, COLORED) + 3 + encoded_size(3, DIRECTION) + WIDTH, 3))
+
+    def forward(self, points: Tensor, normals: Tensor, directions: Tensor, features: Tensor) -> Tensor:
+        """(P, 3) color in (0, 1). `normals` are gradients (P, 3) of the distance, of any length."""
+        inputs = torch.cat([encoded(points, COLORED), normals, encoded(directions, DIRECTION), features], -1)
+        return torch.sigmoid(self.through(inputs))
 
 
 @dataclass(frozen=True)
@@ -139,7 +267,7 @@ class EndoSurf(RadianceField):
     @staticmethod
     def color_term(color: Tensor, target: Tensor) -> Tensor:
         """Mean over rays of the sum over channels of absolute errors (N, 3)."""
-        return COLOR * (color - target).abs().sum() / len(color)
+        return COLOR_WEIGHT * (color - target).abs().sum() / len(color)
 
     @override
     def render(self, rays: Rays, time: float) -> Composited:
@@ -238,7 +366,7 @@ def rounds_of(num: int) -> list[int]:
 
 def depth_term(depth: Tensor, target: Tensor, counted: Tensor) -> Tensor:
     """Mean absolute error of depth (N,) over the rays that count."""
-    return DEPTH * _mean((depth - target).abs(), counted)
+    return DEPTH_WEIGHT * _mean((depth - target).abs(), counted)
 
 
 def surface_terms(distance: Tensor, slope: Tensor, counted: Tensor) -> dict[str, Tensor]:
@@ -246,12 +374,13 @@ def surface_terms(distance: Tensor, slope: Tensor, counted: Tensor) -> dict[str,
 
     The release sums the latter over all rays; those without depth have no point.
     """
-    return {"surface": SURFACE * _mean(distance.abs(), counted), "angle": ANGLE * _mean(torch.relu(slope), counted)}
+    facing_away = _mean(torch.relu(slope), counted)
+    return {"surface": SURFACE_WEIGHT * _mean(distance.abs(), counted), "angle": ANGLE_WEIGHT * facing_away}
 
 
 def eikonal_term(gradients: Tensor, radii: Tensor) -> Tensor:
     """A distance changes by 1 per unit: mean of (|gradient| - 1)^2 over samples (P, 3) at small radii (P,)."""
-    return EIKONAL * _mean((gradients.norm(dim=-1) - 1).square(), radii < EIKONAL_WITHIN)
+    return EIKONAL_WEIGHT * _mean((gradients.norm(dim=-1) - 1).square(), radii < EIKONAL_WITHIN)
 
 
 def neighbor_term(gradients: Tensor, others: Tensor) -> Tensor:
@@ -259,7 +388,7 @@ def neighbor_term(gradients: Tensor, others: Tensor) -> Tensor:
     if not len(gradients):
         return gradients.sum()
     first, second = (normalize(each, dim=-1) for each in (gradients, others))
-    return NEIGHBOR * (first - second + 1e-12).norm(dim=-1).mean()
+    return NEIGHBOR_WEIGHT * (first - second + 1e-12).norm(dim=-1).mean()
 
 
 def _mean(values: Tensor, counted: Tensor) -> Tensor:

@@ -9,15 +9,6 @@ import torch
 from torch import Generator, Tensor, nn
 
 
-def encoded_change(x: Tensor, dx: Tensor, num: int) -> Tensor:
-    """How `frequency_encoding.encoded(x)` changes when x changes along `dx` (..., D): its directional derivative."""
-    parts = [dx]
-    for k in range(num):
-        angle, rate = x * 2.0**k, dx * 2.0**k
-        parts += [torch.cos(angle) * rate, -torch.sin(angle) * rate]
-    return torch.cat(parts, -1)
-
-
 class Linear(nn.Linear):
     """A linear layer that is made without values; `start` gives torch's usual ones."""
 

@@ -62,8 +62,7 @@ class RadianceScene(RenderedScene):
     @override
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """Rays go through the networks in groups, so that memory is bounded."""
-        if not 0 <= time <= 1:
-            raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
+        self.check_time(time)
         camera = camera or self.camera_at(time)
         rays, group = all_rays(camera, self.device), max(1, SAMPLES_AT_ONCE[self.device.type] // self.samples)
         views = [self.field.render(rays.part(k, k + group), time) for k in range(0, len(rays), group)]

@@ -63,7 +63,7 @@ class SceneFrames:
     def render(self, index: int) -> Rendering:
         """See `Reconstruction.render`."""
         frame = self.sequence.frame(index)
-        out = self.scene.filmed(frame.time, frame.camera)
+        out = self.scene.render_with_smoke(frame.time, frame.camera)
         return out.color.cpu().numpy(), out.depth.cpu().numpy()
 
 

@@ -37,10 +37,9 @@ from torch import Tensor
 from ..core.checks import InputError, input_error
 from ..core.geometry import length_unit
 from ..core.types import Camera, Splats
-from ..model.blending import faded
 from ..model.carry import TIED_ANEW_PX
 from ..model.photometric import GRID
-from ..model.scene import Scene, Shown
+from ..model.scene import Scene, Shown, faded
 from ..model.uncertainty import ACROSS, CELLS, DRIFT, START, UNKNOWN_NOISE, Across, Along, half_width
 from ..render.constants import ALPHA_MIN, NEAR_Z
 from ..render.projection import color_slopes

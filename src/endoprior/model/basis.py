@@ -9,9 +9,11 @@ weight at a time, their sum is 1, and the smallest eigenvalue of their Gram matr
 which scales each coefficient on its own, reaches fast motion as soon as slow motion. h_f(t) = max(0, 1 - |t T - f|) is
 1 at frame f of T and 0 at the others: what no smooth curve through the frames holds, such as the shake of a camera,
 stays in the frame that shows it, and a held-out frame in between keeps to the smooth curve. Zero coefficients are the
-identity.
+identity. The sums over basis functions are there twice: in PyTorch for any device, and in Numba for the CPU, which
+reads only the few functions with a weight.
 """
 
+# pyright: reportCallIssue=false
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -19,23 +21,26 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
+from ..compute.parallel_kernels import parallel_njit
+from ..compute.simd import LANES, prefetch
 from ..core.checks import check_shape
 from ..core.config import Config
 from ..core.config_deformation import DEGREE, BasisConfig
-from .gaussians import Gaussians, change_layout, temporal_shapes
-from .motion import Field, Motion
-from .offsets import Gradient, Offsets, RankOneGradient
-from .ops_interface import ModelOps
+from .gaussians import Gaussians, Gradient, Offsets, RankOneGradient, change_layout, temporal_shapes
+from .motion import Field, ModelOps, Motion
 
 TRAINED, GIVEN = ("motion", "changes"), ("frame_motion",)
 """Tensors of `temporal_shapes` that gradients train, as outer products; and those that optical flow gives."""
 FRAME_ROUNDING = 1e-9
 """Share of a frame within which a time is that of the frame: f / T, times T, may miss f by a rounding."""
+_CHUNK = 256  # Gaussians per task
+_AHEAD = 8  # Gaussians between asking for the coefficients of one and reading them
 
 
 class BasisMotion(Motion):
@@ -134,7 +139,7 @@ class _WeightedSum(torch.autograd.Function):
 
 
 def weighted_sum(coefficients: Tensor, weights: NDArray) -> Tensor:
-    """(N, C) sum_b weights[b] * coefficients[:, b] in PyTorch, on any device; `basis_numba.py` computes the same.
+    """(N, C) sum_b weights[b] * coefficients[:, b] in PyTorch, on any device.
 
     Args:
         coefficients: (N, B, C). weights: (B,) values of the basis functions.
@@ -149,3 +154,55 @@ def weighted_sum_backward(v_out: Tensor, weights: NDArray) -> Tensor:
 
 def _like(weights: NDArray, values: Tensor) -> Tensor:
     return torch.as_tensor(weights).to(values.device, values.dtype, non_blocking=True)
+
+
+def weighted_sum_numba(coefficients: Tensor, weights: NDArray) -> Tensor:
+    """See `weighted_sum`; float32 or float64."""
+    values = coefficients.contiguous().numpy()
+    out = np.empty((len(values), values.shape[2]), dtype=values.dtype)
+    _weighted_sum(values, weights.astype(out.dtype), *_support(weights), out)
+    return torch.from_numpy(out)
+
+
+def weighted_sum_backward_numba(v_out: Tensor, weights: NDArray) -> Tensor:
+    """See `weighted_sum_backward`; float32 or float64."""
+    gradient = v_out.contiguous().numpy()
+    v_motion = np.zeros((len(gradient), len(weights), gradient.shape[1]), dtype=gradient.dtype)
+    _weighted_sum_backward(gradient, weights.astype(gradient.dtype), *_support(weights), v_motion)
+    return torch.from_numpy(v_motion)
+
+
+def _support(weights: NDArray) -> tuple[int, int]:
+    """First basis function with a weight, and the one after the last."""
+    support = np.flatnonzero(weights)
+    return (int(support[0]), int(support[-1]) + 1) if len(support) else (0, 0)
+
+
+@parallel_njit()
+def _weighted_sum(motion, weights, first, stop, out):
+    # One task per chunk of Gaussians; writes out (N, channels).
+    num, channels = out.shape
+    stride = motion.shape[1] * channels
+    flat = motion.reshape(-1)
+    for task in prange((num + _CHUNK - 1) // _CHUNK):
+        for n in range(task * _CHUNK, min(num, (task + 1) * _CHUNK)):
+            # Each row is read in one short piece, too short for the hardware prefetcher to foresee the next row.
+            ahead = (n + _AHEAD) * stride
+            for i in range(first * channels, stop * channels + LANES, LANES):
+                prefetch(flat, ahead + i)
+            for c in range(channels):
+                out[n, c] = 0
+            for b in range(first, stop):
+                for c in range(channels):
+                    out[n, c] += weights[b] * motion[n, b, c]
+
+
+@parallel_njit()
+def _weighted_sum_backward(v_out, weights, first, stop, v_motion):
+    # One task per chunk of Gaussians; writes v_motion (N, B, channels) for b in [first, stop); the rest stays 0.
+    num, channels = v_out.shape
+    for task in prange((num + _CHUNK - 1) // _CHUNK):
+        for n in range(task * _CHUNK, min(num, (task + 1) * _CHUNK)):
+            for b in range(first, stop):
+                for c in range(channels):
+                    v_motion[n, b, c] = weights[b] * v_out[n, c]

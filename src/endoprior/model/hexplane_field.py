@@ -21,11 +21,9 @@ from typing_extensions import override
 from ..core.checks import InputError, check_shape
 from ..core.config import Config
 from ..core.config_deformation import DeformationConfig, HexPlaneConfig
-from .gaussians import Gaussians, offset_widths
+from .gaussians import Gaussians, Offsets, offset_widths
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
-from .motion import Field, Motion
-from .offsets import Offsets
-from .ops_interface import ModelOps
+from .motion import Field, ModelOps, Motion
 
 
 class HexPlaneField(Field):

@@ -1,4 +1,4 @@
-"""How Gaussians move: what is trained for it, and the offsets (`offsets.py`) that follow from it at a time.
+"""How Gaussians move: what is trained for it, and the `Offsets` that follow from it at a time.
 
 Two ways to hold motion, and a method may use both: tensors of each Gaussian, which follow it when it is cloned, split
 or removed (`basis.py` has ours); and a `Field` that all Gaussians share (`hexplane_field.py` has the paper's). Offsets
@@ -8,7 +8,8 @@ are added to the raw parameters: centers (mm), log scales, quaternions before no
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,10 +17,23 @@ from torch import Tensor
 from ..core.config import Config
 from ..core.config_deformation import HexPlaneConfig
 from ..system.arrays_file import ArraySpec
-from .gaussians import Gaussians, attribute_shapes
+from .gaussians import Gaussians, Offsets, attribute_shapes
 from .hexplane import PlaneGrid
-from .offsets import Offsets
-from .ops_interface import ModelOps
+
+
+@dataclass(frozen=True)
+class ModelOps:
+    """The operations that motions are computed by; `ops.py` has their two implementations."""
+
+    name: str
+    weighted_sum: Callable[..., Tensor]
+    """Offsets from temporal coefficients: see `basis.weighted_sum`."""
+    weighted_sum_backward: Callable[..., Tensor]
+    """Its gradient: see `basis.weighted_sum_backward`."""
+    hexplane_linear: Callable[..., tuple[Tensor, ...]]
+    """A linear layer on HexPlane features: see `hexplane.hexplane_linear`."""
+    fuse_heads: bool
+    """Compute the hidden layers of all heads as one matrix product: fewer and larger launches on a GPU."""
 
 
 class Field(ABC):

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import torch
 
-from . import basis, basis_numba, hexplane, hexplane_numba
-from .ops_interface import ModelOps
+from . import basis, hexplane, hexplane_numba
+from .motion import ModelOps
 
 NUMBA = ModelOps(
     "numba",
-    basis_numba.weighted_sum,
-    basis_numba.weighted_sum_backward,
+    basis.weighted_sum_numba,
+    basis.weighted_sum_backward_numba,
     hexplane_numba.hexplane_linear,
     fuse_heads=False,
 )

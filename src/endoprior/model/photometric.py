@@ -29,19 +29,19 @@ GRID = (18, 24)
 FLOOR = 1e-8  # added to squared color: the slope of its root is finite
 
 
-def filmed(color: Tensor, grid: Tensor) -> Tensor:
+def add_smoke(color: Tensor, grid: Tensor) -> Tensor:
     """What a camera sees of tissue through smoke; differentiable in `color`.
 
     Args:
         color: (H, W, 3) of the tissue. grid: (I, J, 2) gain and veil of the frame.
     """
     if color.device.type == "cpu" and color.dtype == torch.float32:
-        return _Filmed.apply(color, grid)
-    return filmed_torch(color, grid)
+        return _AddSmoke.apply(color, grid)
+    return add_smoke_torch(color, grid)
 
 
-def filmed_torch(color: Tensor, grid: Tensor) -> Tensor:
-    """See `filmed`."""
+def add_smoke_torch(color: Tensor, grid: Tensor) -> Tensor:
+    """See `add_smoke`."""
     cells = grid.permute(2, 0, 1)[None].to(color)
     gain, veil = interpolate(cells, color.shape[:2], mode="bilinear")[0].unsqueeze(-1)
     return (gain * color.clamp(min=0) ** 2 + veil + FLOOR).sqrt()
@@ -49,10 +49,10 @@ def filmed_torch(color: Tensor, grid: Tensor) -> Tensor:
 
 def behind_smoke(view: RenderedView, grid: Tensor | None) -> RenderedView:
     """A view of tissue as it looks through smoke of coefficients (I, J, 2); itself without any."""
-    return view if grid is None else replace(view, unclamped_color=filmed(view.unclamped_color, grid))
+    return view if grid is None else replace(view, unclamped_color=add_smoke(view.unclamped_color, grid))
 
 
-class _Filmed(torch.autograd.Function):
+class _AddSmoke(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, color: Tensor, grid: Tensor) -> Tensor:
         color, grid = color.detach().contiguous(), grid.contiguous()
@@ -64,7 +64,7 @@ class _Filmed(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_shown: Tensor) -> tuple:
-        return ctx.slope.mul_(v_shown), None
+        return ctx.slope * v_shown, None
 
 
 @parallel_njit(fastmath=REORDERED)

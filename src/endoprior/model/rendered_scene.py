@@ -94,13 +94,20 @@ class RenderedScene(ABC):
         """(I, J, 2) gain and veil of the smoke that the endoscope sees at a time: see `photometric`; None: none."""
         return None
 
-    def filmed(self, time: float, camera: Camera | None = None) -> RenderedView:
+    def render_with_smoke(self, time: float, camera: Camera | None = None) -> RenderedView:
         """`render` with the smoke of that time, as frames show it."""
         return behind_smoke(self.render(time, camera), self.smoke_at(time))
 
+    @staticmethod
+    def check_time(time: float) -> None:
+        """Raise ValueError unless `time` is in [0, 1]."""
+        if not 0 <= time <= 1:
+            raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
+
     def camera_at(self, time: float) -> Camera:
         """Camera of the frame nearest in time."""
-        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
+        nearest = round(time * len(self.cameras))
+        return self.cameras[min(max(nearest, 0), len(self.cameras) - 1)]
 
 
 def no_gaussians(scene: RenderedScene, subject: Path | str = "scene") -> InputError:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +22,16 @@ from ..core.config import Config
 from ..core.geometry import share_of_right
 from ..core.types import Camera, RenderedView, Splats
 from ..system.arrays_file import part, save_arrays
-from .blending import Background, faded, joined, rendered, rendered_many
-from .gaussians import Gaussians
+from .gaussians import Gaussians, Offsets
 from .method import SceneKind, method_of
 from .motion import Field, Motion
-from .offsets import Offsets
 from .ops import ops_for
 from .photometric import between, is_possible
 from .rendered_scene import RenderedScene, check_camera, no_gaussians
 from .scene_facts import MAX_STORED_GAUSSIANS, SCENE_FORMAT, SceneFacts, camera_arrays, demand, scene_facts
+
+Background = tuple[float, float, float]
+"""Color in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,7 @@ class Scene(RenderedScene):
         Raises:
             ValueError: time is not in [0, 1].
         """
-        if not 0 <= time <= 1:
-            raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
+        self.check_time(time)
         position, windows = time * len(self.cameras), self.windows
         last = max(k for k, window in enumerate(windows) if window.start <= position or k == 0)
         weight = 1.0
@@ -116,7 +116,7 @@ class Scene(RenderedScene):
         """See `RenderedScene.render`; where two windows show, the weighted mean of the pictures of both."""
         check_camera(camera)
         seen_by = camera or self.camera_at(time)
-        return rendered(self.parts_at(time, seen_by), seen_by, self.backend, self.background)
+        return render_parts(self.parts_at(time, seen_by), seen_by, self.backend, self.background)
 
     def window_at(self, frame: int) -> tuple[SingleScene, int]:
         """The scene that shows most of a frame, and the position of that frame in it."""
@@ -136,7 +136,7 @@ class Scene(RenderedScene):
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
         """`render` at several times, in one call where the backend can, of cameras of one size: faster on a GPU."""
         parts = [self.parts_at(time, camera) for time, camera in zip(times, cameras, strict=True)]
-        return rendered_many(parts, cameras, self.backend, self.background)
+        return render_parts_many(parts, cameras, self.backend, self.background)
 
     @cached_property
     def method(self) -> SceneKind:
@@ -199,8 +199,7 @@ class SingleScene(Scene):
     def at(self, time: float, camera: Camera | None = None) -> Splats:
         """See `Scene.at`."""
         demand_unforked()  # torch would wait for threads that are not there, before the first kernel is reached
-        if not 0 <= time <= 1:
-            raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
+        self.check_time(time)
         share = 0.0
         if camera is not None and self.baseline_mm:
             share = share_of_right(camera, self.camera_at(time), self.baseline_mm)
@@ -329,3 +328,49 @@ def _shown(window: Window, position: float, weight: float) -> Shown:
     """Args: position: in frames from the start of the sequence."""
     length = window.stop - window.start
     return Shown(window, min(max((position - window.start) / length, 0.0), 1.0), weight)
+
+
+def render_parts(
+    parts: Sequence[tuple[Splats, float]], camera: Camera, backend: render.Backend, background: Background
+) -> RenderedView:
+    """The weighted mean of what `camera` sees of each of some Gaussians."""
+    rasterize, behind = render.load(backend), parts[0][0].means.new_tensor(background)
+    return mixed([(rasterize(splats, camera, background=behind).view, weight) for splats, weight in parts])
+
+
+def render_parts_many(
+    parts: Sequence[Sequence[tuple[Splats, float]]],
+    cameras: Sequence[Camera],
+    backend: render.Backend,
+    background: Background,
+) -> list[RenderedView]:
+    """`render_parts` for several cameras, in one call where the backend can."""
+    every = [(splats, camera) for some, camera in zip(parts, cameras, strict=True) for splats, _ in some]
+    behind = every[0][0].means.new_tensor(background)
+    outputs = render.load_many(backend)([s for s, _ in every], [camera for _, camera in every], background=behind)
+    views = iter(out.view for out in outputs)
+    return [mixed([(next(views), weight) for _, weight in some]) for some in parts]
+
+
+def mixed(views: Sequence[tuple[RenderedView, float]]) -> RenderedView:
+    """The weighted mean of pictures of one size; the weights add up to 1."""
+    if len(views) == 1:
+        return views[0][0]
+    names = [field.name for field in fields(RenderedView)]
+    parts = ([weight * getattr(view, name) for view, weight in views] for name in names)
+    return RenderedView(*(reduce(torch.add, part) for part in parts))
+
+
+def faded(splats: Splats, weight: float) -> Splats:
+    """`splats` with their optical depth multiplied by `weight` in (0, 1]."""
+    if weight == 1:
+        return splats
+    return Splats(**splats.tensors | {"opacities": 1 - (1 - splats.opacities) ** weight})
+
+
+def joined(parts: Sequence[Splats]) -> Splats:
+    """The Gaussians of all `parts`, which have the same tensors."""
+    if len(parts) == 1:
+        return parts[0]
+    names = [field.name for field in fields(Splats) if getattr(parts[0], field.name) is not None]
+    return Splats(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -18,17 +18,22 @@ points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 from scipy.stats import t as student_t
 
 from ..core.geometry import cells_at, project
+from ..core.ranges import evenly_spaced
+from ..core.types import Frame
 from .carry import CarriedPoints
-from .scene import Scene
+from .scene import RenderedScene, Scene, SingleScene
+from .surface import render_surface
 
 LEVEL = 0.95
 """Share of the true values that a range holds, unless another is asked for."""
@@ -39,6 +44,10 @@ CELLS = 32, 40
 """Rows and columns of the small masks that a scene keeps of its frames: a tool hides the points behind it."""
 UNKNOWN_NOISE = 0.005
 """Of depth, as a share of it, in scenes from before it was measured."""
+NUM_FRAMES = 8
+"""Training frames, evenly spaced, whose rendered depth is compared with the measured one."""
+WITHIN_ONE_DEVIATION = 0.68
+"""Share of normal errors that are less than their standard deviation: far off edges do not count more for being far."""
 
 
 class Across(NamedTuple):
@@ -210,3 +219,38 @@ def places_of(places: NDArray, tissue: NDArray[np.uint8] | None) -> NDArray[np.i
     around = np.asarray(minimum_filter(shown, 3, mode="constant", cval=0), bool)
     x, y = cells_at(np.where(inside[:, None], places, 0) * (columns, rows), columns, rows)
     return np.where(inside & around[y, x], SEEN, np.where(inside & shown[y, x], NEAR, HIDDEN))
+
+
+def with_error_sources(scene: RenderedScene, frames: Sequence[Frame]) -> RenderedScene:
+    """The scene with what tells the errors of carried points later; radiance fields as given.
+
+    That is the tissue mask of each frame, small, where held-out frames get that of the nearest training frame; and the
+    noise of its depth.
+
+    Args:
+        frames: those it was trained on.
+    """
+    if not isinstance(scene, SingleScene):
+        return scene
+    indices = np.array([frame.index for frame in frames])
+    nearest = np.abs(np.arange(len(scene.cameras))[:, None] - indices).argmin(1)
+    tissue = np.stack([small_mask(frame) for frame in frames])[nearest]
+    chosen = [frames[k] for k in evenly_spaced(len(frames), NUM_FRAMES)]
+    return replace(scene, tissue=torch.from_numpy(tissue), depth_noise=depth_noise(scene, chosen))
+
+
+def small_mask(frame: Frame) -> NDArray[np.uint8]:
+    """(I, J) share of each cell of `CELLS` that is tissue, 0..255."""
+    share = cv2.resize(frame.tissue_mask.astype(np.float32), CELLS[::-1], interpolation=cv2.INTER_AREA)
+    return np.round(255 * share).astype(np.uint8)
+
+
+def depth_noise(scene: SingleScene, frames: list[Frame]) -> float:
+    """How far rendered depth is from measured depth, as a share of it: one standard deviation; 0 without any."""
+    errors = [np.zeros(0)]
+    for frame in frames:
+        rendered = render_surface(scene, frame.time, frame.camera).depth
+        both = (rendered > 0) & frame.depth_valid & frame.tissue_mask
+        errors.append(np.abs(rendered[both] / frame.depth[both] - 1))
+    found = np.concatenate(errors)
+    return float(np.quantile(found, WITHIN_ONE_DEVIATION)) if len(found) else 0.0

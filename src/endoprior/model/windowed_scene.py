@@ -54,7 +54,7 @@ class WindowedScene(Scene):
 
     @cached_property
     def _scenes(self) -> BoundedCache[SingleScene]:
-        return BoundedCache(CACHE_BYTES, _num_bytes)
+        return BoundedCache(CACHE_BYTES, lambda scene: sum(value.nbytes for value in scene.gaussians.tensors.values()))
 
     @cached_property
     def windows(self) -> Sequence[Window]:
@@ -103,7 +103,3 @@ def save_index(path: Path, scene: WindowedScene) -> None:
     """Write the list of windows only; the windows are in place."""
     spans = torch.tensor([[span.start, span.stop, span.num_gaussians] for span in scene.spans], dtype=torch.int64)
     save_arrays(path, camera_arrays(scene.cameras) | {"windows": spans}, scene_facts(scene), WINDOWS_FORMAT)
-
-
-def _num_bytes(scene: SingleScene) -> int:
-    return sum(value.numel() * value.element_size() for value in scene.gaussians.tensors.values())

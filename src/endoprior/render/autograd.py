@@ -45,9 +45,15 @@ class Kernels:
     Gaussians."""
 
 
-def empty(like: Tensor, *shapes: tuple[int, ...]) -> Tensors:
-    """Tensors of these shapes on the device of another one."""
-    return tuple(like.new_empty(shape) for shape in shapes)
+def empty_gaussians2d(like: Tensor, num: int) -> Tensors:
+    """Uninitialized means2d, conic_ldl, z, colors and color_slopes2d of `num` Gaussians, on the device of a tensor."""
+    return tuple(like.new_empty(shape) for shape in ((num, 2), (num, 3), (num,), (num, 3), (num, 2, 3)))
+
+
+def empty_images(like: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Uninitialized color, depth and transmittance of an image of that size, on the device of a tensor."""
+    shape = size[::-1]
+    return like.new_empty((*shape, 3)), like.new_empty(shape), like.new_empty(shape)
 
 
 def rasterize_with(

@@ -28,6 +28,8 @@ class Projected:
     """(N, 2) centers, px."""
     cov2d: Tensor
     """(N, 3) covariance entries xx, xy, yy, blur included, px^2."""
+    det: Tensor
+    """(N,) its determinant, px^4, as `project` gives it: of a needle `xx yy - xy^2` keeps no digit."""
     z: Tensor
     """(N,) camera-space z of the centers, mm."""
     colors: Tensor
@@ -36,8 +38,6 @@ class Projected:
     """(N, 2, 3) change of the color per px along x, then y."""
     radii: Tensor
     """(N,) int32 ceil(3 sigma) along the long axis, px; 0 where nothing of it can reach a pixel."""
-    det: Tensor | None = None
-    """(N,) determinant of `cov2d`, px^4, as `project` gives it: of a needle `xx yy - xy^2` keeps no digit."""
 
 
 def check(splats: Splats, background: Tensor) -> int:
@@ -105,7 +105,7 @@ def project(splats: Splats, camera: Camera) -> Projected:
     means2d, cov2d, det, z, colors, slopes2d = _project(safe, camera)
     last_pixel = means2d.new_tensor([camera.width, camera.height]) - 0.5
     radii = radii_of(means2d, cov2d, safe.opacities, usable, last_pixel)
-    return Projected(means2d, cov2d, z, colors, slopes2d, radii, det)
+    return Projected(means2d, cov2d, det, z, colors, slopes2d, radii)
 
 
 def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:

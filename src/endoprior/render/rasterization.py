@@ -136,12 +136,12 @@ def rasterize(
     colors = colors.expand(len(cameras), *colors.shape[-2 if sh_degree is None else -3 :])
     steps = _steps(backend or ("numba" if means.device.type == "cpu" else "triton"))
     seen = []
-    for camera, view, given in zip(cameras, viewmats, colors, strict=True):
-        coefficients = means.new_zeros(len(means), 1, 3) if sh_degree is None else given
+    for camera, view, own_colors in zip(cameras, viewmats, colors, strict=True):
+        coefficients = means.new_zeros(len(means), 1, 3) if sh_degree is None else own_colors
         splats = Splats(means, quats, scales, _not_beyond(far_plane, means, opacities, view), coefficients)
         steps.demand(splats, backgrounds)
         found = _project(steps, splats, camera, view, scale)
-        seen.append(found if sh_degree is not None else found._replace(colors=given))
+        seen.append(found if sh_degree is not None else found._replace(colors=own_colors))
     means2d = torch.stack([each.means2d for each in seen])  # images are made of it: its gradient can be kept
     images, alphas = [], []
     for each, centers, background in zip(seen, means2d, backgrounds, strict=True):
@@ -171,9 +171,9 @@ def _reject(options: dict[str, Any], render_mode: str, near_plane: float, far_pl
             names = (*ONLY, *FREE, "near_plane", "far_plane", "sh_degree", "backgrounds", "render_mode", "backend")
             fix = or_did_you_mean("leave it out.", name, names)
             raise input_error(name, "an option of `rasterize`", "none of its options", fix)
-        is_tensor = isinstance(value, Tensor)
-        if is_tensor or value != ONLY[name]:
-            got = "a tensor" if is_tensor else repr(value)
+        array = "a tensor" if isinstance(value, Tensor) else "an array" if isinstance(value, np.ndarray) else ""
+        if array or value != ONLY[name]:
+            got = array or repr(value)
             fix = "leave it out; `gsplat.rasterization` has it, on an NVIDIA GPU."
             raise input_error(name, f"{ONLY[name]!r}, as nothing else is supported", got, fix)
     if render_mode not in get_args(RenderMode):
@@ -226,14 +226,13 @@ def _demand_one_type(splats: Splats, background: Tensor) -> None:
 def _project_reference(camera: Camera, opacities: Tensor, *gaussians: Tensor) -> Tensors:
     means, quats, scales, coefficients, slopes = gaussians
     seen = project(Splats(means, quats, scales, opacities, coefficients, slopes), camera)
-    assert seen.det is not None
     shape = torch.cat([seen.cov2d, seen.det[:, None]], -1)
     return seen.means2d, shape, seen.z, seen.colors, seen.color_slopes2d, seen.radii
 
 
 def _composite_reference(size: tuple[int, int], radii: Tensor, background: Tensor, *gaussians: Tensor) -> Tensors:
     means2d, shape, z, colors, slopes, opacities = gaussians
-    seen = Projected(means2d, shape[:, :3], z, colors, slopes, radii, shape[:, 3])
+    seen = Projected(means2d, shape[:, :3], shape[:, 3], z, colors, slopes, radii)
     return composite(seen, opacities, size, background)
 
 

@@ -29,7 +29,6 @@ def composite(
     seen: Projected, opacities: Tensor, size: tuple[int, int], background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Color (H, W, 3), alpha (H, W) and depth (H, W) of projected Gaussians; `size` is (width, height), px."""
-    assert seen.det is not None
     order = seen.z.argsort(stable=True)
     order = order[seen.radii[order] > 0]
     offsets = _offsets(seen.means2d[order], size)

@@ -69,7 +69,7 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
     span, unit = depth_span(scene), length_unit(sequence.depth_is_relative)
     rows = []
     for frame in (frames[k] for k in shown):
-        out = scene.filmed(frame.time, frame.camera)
+        out = scene.render_with_smoke(frame.time, frame.camera)
         color, depth = out.color.cpu().numpy(), out.depth.cpu().numpy()
         error = np.abs(color - frame.rgb).mean(-1)
         cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered", to_u8(color))]

@@ -21,12 +21,12 @@ from ..data.window_plan import look_through, plan_windows
 from ..model.method import method_of
 from ..model.scene import RenderedScene, SingleScene
 from ..model.scene_file import load_scene
+from ..model.uncertainty import with_error_sources
 from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
 from ..system.atomic import write_text, writing
 from ..system.console import complain
 from ..system.memory import freed_memory_kept
 from ..training.divergence import Diverged
-from ..training.error_sources import with_error_sources
 from ..training.method import trainer_for
 from ..training.preflight import note_on_budget, reject_ignored_options, reject_too_large
 from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
@@ -203,12 +203,12 @@ class TrainingRun:
         if self.out is None:
             self.trainer.start()
             self.trainer.run(list(observers))
-            return with_error_sources(self.trainer.scene(), self.trainer.sequence)
+            return with_error_sources(self.trainer.scene(), self.trainer.sequence.frames("train"))
         out, trainer = self.out, self.trainer
         fingerprint = trainer.sequence.fingerprint()
         with held_folder(out, resume=self.resume, begin=lambda: self._begin(out, fingerprint)):
             self._train_in(out, fingerprint, list(observers), checkpoint_seconds)
-            scene = with_error_sources(trainer.scene(), trainer.sequence)
+            scene = with_error_sources(trainer.scene(), trainer.sequence.frames("train"))
             scene.save(out / SCENE)
         return scene
 

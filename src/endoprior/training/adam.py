@@ -25,8 +25,8 @@ from torch.optim.adam import adam
 
 from ..compute.parallel_kernels import parallel_njit
 from ..compute.simd import LANES, REORDERED, prefetch
+from ..model.gaussians import RankOneGradient, UnstoredGradient
 from ..model.hexplane import FRESH, TOUCHED, PlaneGrid
-from ..model.offsets import RankOneGradient, UnstoredGradient
 
 BETA1, BETA2 = 0.9, 0.999
 CHUNK = 128  # rows per task

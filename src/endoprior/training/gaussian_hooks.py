@@ -24,7 +24,7 @@ from .density_stats import DensityStats
 from .frames import TrainingFrames
 from .losses import supervised_terms
 from .method import Method
-from .ops_interface import TrainingOps
+from .ops import TrainingOps
 from .optimizer import Rate, rate_of
 from .state import Drawn
 from .trainer import Stage
@@ -39,7 +39,7 @@ class GaussianHooks(Method):
     """
 
     uses_prior = True  # the texture prior of the frames is computed, for density control and the temporal term
-    keeps_optimizer = False  # adam's moments and steps go on from the coarse to the fine stage
+    keeps_optimizer = False  # Adam's moments and steps go on from the coarse to the fine stage
     starts_from_flow = False  # its Gaussians can start with the motion that optical flow finds: `init.motion flow`.
     color_is_error = False
     """Its term `color` is the mean absolute error over tissue; else the divergence check has that computed."""
@@ -80,7 +80,7 @@ class GaussianHooks(Method):
 
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         """The weighted terms of the loss, () each."""
-        return supervised_terms(drawn.out, drawn.frame, cfg.loss, ops)
+        return supervised_terms(drawn.out, drawn.frame, cfg.loss, ops.supervised_losses)
 
     def density_due(self, stage: Stage, iteration: int, last: bool, cfg: Config) -> bool:
         """Whether Gaussians are cloned, split and removed after this iteration; `last`: of the stage."""

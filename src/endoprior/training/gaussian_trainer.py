@@ -35,9 +35,8 @@ from .density_stats import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .gaussian_hooks import GaussianHooks
-from .missed_tools import VISITS, MaskDoubt
-from .ops import ops_for
-from .ops_interface import TrainingOps
+from .missed_tools import VISITS, MissedToolFinder
+from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
 from .photometric import ClearedFrames, smoke_of
 from .state import GaussiansState
@@ -58,8 +57,8 @@ def spatial_scale(extent: float, fit_to_clip: bool) -> float:
     return min(extent, STILL_CAMERA_SCALE) if fit_to_clip else extent
 
 
-def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, ArraySpec]:
-    """The arrays of a `GaussiansState`; where masks are in doubt, also how much of each frame was left out."""
+def state_schema(motion: Motion, cfg: Config, *, finds_missed_tools: bool) -> dict[str, ArraySpec]:
+    """The arrays of a `GaussiansState`; where missed tools are looked for, also how much of each frame was left out."""
     model = motion.schema(cfg)
     trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
     trained |= {name: ArraySpec("float32", shape) for name, shape in motion.parameter_shapes(cfg).items()}
@@ -76,7 +75,7 @@ def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, Arra
         optimizer |= {f"plane_adam.{name}": spec for name, spec in of_planes.items()}
     found = {f"optimizer.{name}": spec for name, spec in optimizer.items()}
     found |= {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
-    found |= {"left_out": ArraySpec("float32", ("F", VISITS))} if doubts else {}
+    found |= {"left_out": ArraySpec("float32", ("F", VISITS))} if finds_missed_tools else {}
     if cfg.loss.track_weight and cfg.init.motion == "flow":
         found["tracks.displacement"] = ArraySpec("float32", ("F", "P", 3))
         found |= {"tracks.followed": ArraySpec("float32", ("F", "P")), "tracks.rows": ArraySpec("int64", ("N",))}
@@ -116,7 +115,7 @@ class GaussianTrainer(Trainer):
             rasterize=render.load(cfg.render.backend),
             ops=self.ops,
             check=DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
-            doubt=MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
+            missed_tools=MissedToolFinder(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
             background=torch.tensor(self.method.background, device=self.device),
         )
 
@@ -151,7 +150,7 @@ class GaussianTrainer(Trainer):
                 tracks = StartTracks.along(motion, [frame.time for frame in frames]).to(self.device)
         field = self.motion.field(gaussians["means"].detach(), cfg)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        shares = torch.zeros(len(self.sequence.indices("train")), VISITS) if self.step_once.doubt else None
+        shares = torch.zeros(len(self.sequence.indices("train")), VISITS) if self.step_once.missed_tools else None
         self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, shares)
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
@@ -177,7 +176,7 @@ class GaussianTrainer(Trainer):
 
     def schema(self) -> dict[str, ArraySpec]:
         """See `Trainer.schema`."""
-        return state_schema(self.motion, self.cfg, doubts=self.step_once.doubt is not None)
+        return state_schema(self.motion, self.cfg, finds_missed_tools=self.step_once.missed_tools is not None)
 
     def step(self) -> StepReport:
         """See `Trainer.step`, and `TrainingStep` for what happens in it."""

@@ -8,7 +8,8 @@ Sums run over rows, then over the rows in order, so they are bit-identical whate
 # pyright: reportCallIssue=false
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,9 +22,6 @@ from ..compute.simd import REORDERED
 from ..core.config import LossConfig
 from ..core.types import RenderOutput
 from .frames import TrainingFrame
-
-if TYPE_CHECKING:
-    from .ops_interface import TrainingOps
 
 BAND = 16  # rows per task
 MIN_DEPTH_PIXELS = 10  # a frame with fewer pixels of measured tissue depth gets no depth loss
@@ -112,10 +110,16 @@ def supervised_losses(
     return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
 
 
-def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, ops: TrainingOps) -> dict[str, Tensor]:
-    """Weighted color, depth, total-variation and edge terms, and that of what is hidden, () each."""
+def supervised_terms(
+    out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, losses: Callable[..., Tensor]
+) -> dict[str, Tensor]:
+    """Weighted color, depth, total-variation and edge terms, and that of what is hidden, () each.
+
+    Args:
+        losses: the implementation of `supervised_losses`, of `TrainingOps`.
+    """
     depth_weight = cfg.depth_weight if frame.num_measured >= MIN_DEPTH_PIXELS else 0.0
-    fused = ops.supervised_losses(
+    fused = losses(
         out.color,
         out.depth,
         frame.rgb_u8,

@@ -80,8 +80,8 @@ def missed_tools(
     return (cv2.dilate(entering.astype(np.uint8), disk(1)) > 0) & tissue_mask
 
 
-class MaskDoubt:
-    """Takes pixels that show a tool in spite of the mask out of a training frame."""
+class MissedToolFinder:
+    """Finds the pixels of training frames that show a tool in spite of the mask."""
 
     def __init__(self, sequence: FrameSequence) -> None:
         indices = sequence.indices("train")
@@ -94,7 +94,7 @@ class MaskDoubt:
         self._size = max(1, round(width * scale)), max(1, round(height * scale))
         self._tissue: BoundedCache[NDArray[np.bool_]] = BoundedCache(cache_bytes() // 4, lambda found: found.nbytes)
 
-    def counted(self, frame: TrainingFrame, color: Tensor) -> TrainingFrame:
+    def without_tools(self, frame: TrainingFrame, color: Tensor) -> TrainingFrame:
         """The frame without the pixels that show a missed tool; `color` (H, W, 3) is the rendered frame, in [0, 1]."""
         mask, size = frame.tissue_mask.cpu().numpy(), self._size
         rendered, target = (_resized(x.detach().cpu().numpy(), size) for x in (color, frame.rgb))
@@ -107,11 +107,11 @@ class MaskDoubt:
         measured = frame.measured & keep
         return replace(frame, tissue_mask=frame.tissue_mask & keep, measured=measured, num_measured=int(measured.sum()))
 
-    def share(self, frame: TrainingFrame, counted: TrainingFrame) -> float:
-        """Share of the view, 0..1, that `counted` leaves out of the frame from which it was made."""
-        if counted is frame:
+    def share(self, frame: TrainingFrame, kept: TrainingFrame) -> float:
+        """Share of the view, 0..1, that `kept`, which `without_tools` made of a frame, leaves out."""
+        if kept is frame:
             return 0.0
-        left_out = float((frame.tissue_mask & ~counted.tissue_mask).float().mean())
+        left_out = float((frame.tissue_mask & ~kept.tissue_mask).float().mean())
         return min(left_out / max(float(self._view.mean()), 1e-6), 1.0)
 
     def _surely_tissue(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -5,11 +5,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
+from torch import Tensor
 
 from ..model import ops as model_ops
+from ..model.motion import ModelOps
 from . import adam, density_stats, local_motion, losses, tracks
-from .ops_interface import TrainingOps
+
+
+@dataclass(frozen=True)
+class TrainingOps:
+    """One implementation of each operation; those in PyTorch document them."""
+
+    model: ModelOps
+    supervised_losses: Callable[..., Tensor]
+    track_term: Callable[..., Tensor]
+    local_consistency: Callable[..., tuple[Tensor, Tensor]]
+    add_gradient: Callable[..., None]
+    add_score: Callable[..., None]
+    valid_projection: Callable[..., Tensor]
+    count_unusable: Callable[..., int | Tensor]
+    count_unusable_in_planes: Callable[..., int | Tensor]
+    adam_step: Callable[..., None]
+    adam_basis_step: Callable[..., None]
+    adam_planes_step: Callable[..., None]
+
 
 NUMBA = TrainingOps(
     model=model_ops.NUMBA,

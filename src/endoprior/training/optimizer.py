@@ -12,13 +12,12 @@ from torch import Tensor
 
 from ..core.config import Config, OptimConfig
 from ..model.basis import GIVEN, TRAINED
-from ..model.gaussians import ATTRIBUTES, Gaussians, change_layout
+from ..model.gaussians import ATTRIBUTES, Gaussians, RankOneGradient, UnstoredGradient, change_layout
 from ..model.motion import Field
-from ..model.offsets import RankOneGradient, UnstoredGradient
 from ..system.arrays_file import part
 from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import MAX_GRADIENT
-from .ops_interface import TrainingOps
+from .ops import TrainingOps
 
 Rate = Callable[[int], float]  # learning rate at an iteration (1-based, within the stage)
 PLANES = "planes"  # name of the planes of a field, among the names of parameters

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ..core.types import RenderOutput, Splats
-from ..model.gaussians import Gaussians
+from ..model.gaussians import Gaussians, Offsets
 from ..model.motion import Field
-from ..model.offsets import Offsets
 from .density_stats import DensityStats
 from .frames import TrainingFrame
 from .optimizer import Optimizer

@@ -18,15 +18,15 @@ from ..core.config import Config
 from ..core.types import Camera
 from ..model.hexplane_field import HexPlaneField
 from ..model.motion import Motion
-from ..model.photometric import filmed
+from ..model.photometric import add_smoke
 from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .gaussian_hooks import GaussianHooks
 from .losses import color_l1
-from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
-from .ops_interface import TrainingOps
+from .missed_tools import START, MissedToolFinder, missed_tool_frames, record_visit
+from .ops import TrainingOps
 from .state import Before, Drawn, GaussiansState
 from .temporal import temporal_terms
 from .trainer import Stage, StepReport, stage_length
@@ -52,7 +52,7 @@ class TrainingStep:
     rasterize: Rasterizer
     ops: TrainingOps
     check: DivergenceCheck
-    doubt: MaskDoubt | None  # takes missed tools out of the frames; None trusts the masks
+    missed_tools: MissedToolFinder | None  # None: the masks are trusted
     background: Tensor  # (3,) color behind everything
     smoke: Tensor | None = None  # (F, I, J, 2) of each training frame: see `model.photometric`; None: no smoke
 
@@ -140,11 +140,11 @@ class TrainingStep:
         out = render(splats)
         out.means2d.retain_grad()  # density control grows where this gradient is large
         if self.smoke is not None:
-            out = replace(out, color=filmed(out.color, self.smoke[position]))
+            out = replace(out, color=add_smoke(out.color, self.smoke[position]))
         compared, left_out = frame, None
-        if self.doubt and fine and not is_right and self._knows_tissue(state):
-            compared = self.doubt.counted(frame, out.color)
-            left_out = self.doubt.share(frame, compared)
+        if self.missed_tools and fine and not is_right and self._knows_tissue(state):
+            compared = self.missed_tools.without_tools(frame, out.color)
+            left_out = self.missed_tools.share(frame, compared)
         return Drawn(
             stage=state.stage,
             iteration=iteration,

@@ -21,7 +21,7 @@ from .frames import TrainingFrame
 from .local_motion import NUM_NEIGHBORS
 
 if TYPE_CHECKING:
-    from .ops_interface import TrainingOps
+    from .ops import TrainingOps
     from .state import Before, Drawn
 
 DISPLACEMENT_WEIGHT, DISTANCE_WEIGHT = 1.0, 0.2  # lambda_disp and lambda_dist

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...core.types import Camera, RenderOutput, Splats
-from ..autograd import Kernels, Tensors, empty, rasterize_with
+from ..autograd import Kernels, Tensors, empty_gaussians2d, empty_images, rasterize_with
 from ..projection import check, check_device, jacobian_limits
 from . import tiles
 from .composite import NUM_SUMS, composite_backward, composite_forward, gather
@@ -50,8 +50,7 @@ def _arrays(*tensors: Tensor) -> list[NDArray]:
 def _project_forward(gaussians: Tensors, opacities: Tensor, camera: Camera) -> Tensors:
     means, quats, scales, sh, color_slopes = gaussians
     num = len(means)
-    shapes = ((num, 2), (num, 3), (num,), (num, 3), (num, 2, 3))
-    outputs = (*empty(means, *shapes), means.new_empty(num, dtype=torch.int32))
+    outputs = (*empty_gaussians2d(means, num), means.new_empty(num, dtype=torch.int32))
     inputs = _arrays(means, quats, scales, opacities, sh, color_slopes)
     project_forward(*inputs, *camera_arrays(camera), camera.width, camera.height, *_arrays(*outputs))
     return outputs
@@ -70,8 +69,7 @@ def _bin_tiles(gaussians: Tensors, radii: Tensor, size: tuple[int, int]) -> tile
 def _composite_forward(
     lists: tiles.Tiles, background: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor, NDArray[np.int64]]:
-    shape = size[::-1]
-    color, depth, transmittance = empty(background, (*shape, 3), shape, shape)
+    color, depth, transmittance = empty_images(background, size)
     tile_ends = np.empty(len(lists.by_cost), np.int64)
     work = (lists.records, lists.pairs, lists.tile_starts, lists.by_cost, numba.get_num_threads())
     composite_forward(*work, *_arrays(background, color, depth, transmittance), tile_ends)
@@ -91,7 +89,7 @@ def _composite_backward(
     work = (lists.records, lists.pairs, lists.tile_starts, tile_ends, lists.by_cost, numba.get_num_threads())
     composite_backward(*work, *_arrays(*images, *cotangents), sums)
     num = len(opacities)
-    grads = empty(opacities, (num, 2), (num, 3), (num,), (num, 3), (num, 2, 3), (num,))
+    grads = (*empty_gaussians2d(opacities, num), opacities.new_empty(num))
     gather(sums, lists.slot_starts, *_arrays(conic_ldl, color_slopes2d, opacities, *grads))
     return grads
 

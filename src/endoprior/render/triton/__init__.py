@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ...core.checks import InputError
 from ...core.types import Camera, RenderOutput, Splats
-from ..autograd import Kernels, Tensors, empty, rasterize_with
+from ..autograd import Kernels, Tensors, empty_gaussians2d, empty_images, rasterize_with
 from ..projection import check, check_device
 from ..sh import degree_of
 
@@ -79,8 +79,7 @@ def _start_driver() -> None:
 def _project_forward(gaussians: Tensors, opacities: Tensor, camera: Camera) -> Tensors:
     means, quats, scales, sh, color_slopes = gaussians
     num, lens = len(means), lens_of(camera, means.device)
-    shapes = ((num, 2), (num, 3), (num,), (num, 3), (num, 2, 3))
-    outputs = (*empty(means, *shapes), means.new_empty(num, dtype=torch.int32))
+    outputs = (*empty_gaussians2d(means, num), means.new_empty(num, dtype=torch.int32))
     inputs = (means, quats, scales, opacities, sh, color_slopes, lens, num, camera.width, camera.height)
     options = {"DEGREE": degree_of(sh.shape[1]), "BLOCK": BLOCK, **WARPS}
     launch(project_forward, triton.cdiv(num, BLOCK), *inputs, *outputs, **options)
@@ -99,8 +98,7 @@ def _project_backward(gaussians: Tensors, camera: Camera, radii: Tensor, cotange
 def _composite_forward(
     lists: tiles.Tiles, background: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    shape = size[::-1]
-    color, depth, transmittance = empty(background, (*shape, 3), shape, shape)
+    color, depth, transmittance = empty_images(background, size)
     outputs = color, depth, transmittance, torch.empty_like(lists.tile_starts[:-1])
     inputs = (lists.records, lists.ranks, lists.tile_starts, background, *size, tiles.columns(size[0]))
     launch(composite_forward, len(outputs[3]), *inputs, *outputs, ROWS=tiles.ROWS_PER_LANE, **WARP)
@@ -121,7 +119,7 @@ def _composite_backward(
     work = (lists.records, lists.ranks, lists.slots, lists.tile_starts, tile_ends)
     arguments = (*work, width, height, tiles.columns(width), *images, *cotangents, sums)
     launch(composite_backward, len(tile_ends), *arguments, ROWS=tiles.ROWS_PER_LANE, **WARP)
-    grads = empty(opacities, (num, 2), (num, 3), (num,), (num, 3), (num, 2, 3), (num,))
+    grads = (*empty_gaussians2d(opacities, num), opacities.new_empty(num))
     arguments = (sums, lists.slot_ends, lists.order, conic_ldl, color_slopes2d, opacities, num, *grads)
     launch(gather, triton.cdiv(num, GATHERED), *arguments, BLOCK=GATHERED, SIDE_BY_SIDE=SIDE_BY_SIDE, **WARP)
     return grads
