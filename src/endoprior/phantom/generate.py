@@ -94,7 +94,7 @@ def choose_tracks(scene: PhantomScene) -> NDArray[np.int64]:
     weight = pull**2
     weight[even] = 0
     extra = min(cfg.tracks - spread, int((weight > 0).sum()))
-    near_pulls = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum())
+    near_pulls = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum()) if extra else even[:0]
     chosen = np.sort(np.concatenate([even, near_pulls]))
     return np.stack([rows[chosen], columns[chosen]], -1)
 
@@ -123,8 +123,8 @@ def write_phantom(
       `cfg.tissue`;
     - `truth/depth/*.npy`, (H, W) float32 z of the tool-free tissue, mm;
     - `truth/seen/*.npy`, (H, W) bool in test frames: behind a tool, and some training frame shows that tissue;
-    - `truth/tracks.npz`: `points` (T, P, 3) float32 mm in the axes of the frame's camera, `visible` (T, P) bool; with
-      `cfg.has_regions` also `region` (P,);
+    - `truth/tracks.npz`: `points` (T, P, 3) float32 mm in the axes of the frame's camera, `visible` (T, P) bool, False
+      behind tools, border and overlay; with `cfg.has_regions` also `region` (P,);
     - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
       0 where the endoscope does not see the tissue; `truth/side/world_to_camera.json` has their poses (4, 4);
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
@@ -169,21 +169,22 @@ def _write_cavity(writer: FrameFiles, scene: PhantomScene, outside: Mask, progre
     behind_tools, sides = _BehindTools(scene), {}
     exposure, gains = None, []
     for index in range(cfg.frames):
-        frame = render_frame(scene, index)
+        frame, drawn, rows = render_frame(scene, index), overlay(cfg, index), rows_after_cuts(events, index)
         if exposure is None:
             exposure = Exposure.of_first(scene, frame)
             sides = side_eyes(float(np.median(frame.z))) if cfg.side_views else {}
         gains.append(exposure.now / exposure.first)
-        seen = visible_points(frame.now.vertices, frame.z, frame.tool_mask, cfg)
-        behind_tools.add(frame, seen)
+        in_body = shows_body(events, index)
+        hidden = frame.tool_mask | (outside | drawn)[rows]
+        seen = visible_points(frame.now.vertices, frame.z, hidden, cfg) & in_body
+        behind_tools.add(index, frame.tool_mask & in_body, seen, rows)
         points.append(frame.now.vertices[tracked[:, 0], tracked[:, 1]])
-        is_clear = shows_body(events, index) and not is_mirrored(events, index)
-        visible.append(seen[tracked[:, 0], tracked[:, 1]] & is_clear)
-        _write_truth(writer, scene, frame, exposure.first, lens, rows_after_cuts(events, index))
+        visible.append(seen[tracked[:, 0], tracked[:, 1]] & (not is_mirrored(events, index)))
+        _write_truth(writer, scene, frame, exposure.first, lens, rows)
         if is_test_frame(index):
             _write_sides(writer, scene, frame, exposure.first, sides)
         recorded = with_events(record(scene, frame, exposure.now, lens), events, index, cfg.seed)
-        _write_recorded(writer, recorded, outside, overlay(cfg, index))
+        _write_recorded(writer, recorded, outside, drawn)
         if cfg.gain == "auto":
             exposure = exposure.after(frame)
         progress(index + 1, cfg.frames)
@@ -198,22 +199,26 @@ class _BehindTools:
     def __init__(self, scene: PhantomScene) -> None:
         self._scene = scene
         self._trained_on = np.zeros(scene.a.shape, bool)  # (MH, MW) vertices that some training frame shows
-        self._tools: dict[int, NDArray[np.uint8]] = {}  # packed mask of each test frame
+        self._tools: dict[int, tuple[NDArray[np.uint8], slice]] = {}  # packed mask and rows of each test frame
 
-    def add(self, frame: RenderedFrame, seen: Mask) -> None:
-        """Note a frame, in which the vertices `seen` (MH, MW) are visible."""
-        if is_test_frame(frame.index):
-            self._tools[frame.index] = np.packbits(frame.tool_mask)
+    def add(self, index: int, tool: Mask, seen: Mask, rows: slice) -> None:
+        """Note a frame with the mask `tool` (H, W), in which the vertices `seen` (MH, MW) are visible.
+
+        Args:
+            rows: in which order it is written.
+        """
+        if is_test_frame(index):
+            self._tools[index] = np.packbits(tool), rows
         else:
             self._trained_on |= seen
 
     def write(self, writer: FrameFiles) -> None:
         """Write `truth/seen`."""
         cfg = self._scene.cfg
-        for index, packed in self._tools.items():
+        for index, (packed, rows) in self._tools.items():
             hits = pixel_hits(self._scene.seen_vertices(index / (cfg.frames - 1)), cfg)
             tool = np.unpackbits(packed, count=hits[..., 0].size).reshape(hits.shape[:2]) > 0
-            writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, self._trained_on, tool))
+            writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, self._trained_on, tool)[rows])
 
 
 def _write_recorded(writer: FrameFiles, recorded: RecordedFrame, outside: Mask, drawn: Mask) -> None:
