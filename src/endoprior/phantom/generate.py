@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.geometry import strain_between
 from ..data.sequence import is_test_frame
 from ..data.writer import FrameFiles, SequenceMeta, new_sequence
-from .camera import STILL, Eye
+from .camera import AT_ORIGIN, CameraPose
 from .config import PhantomConfig
 from .events import is_mirrored, parse_events, shows_body
 from .recording import Exposure, RecordedFrame, RenderedFrame, record, render_frame, rows_after_cuts, with_events
@@ -23,7 +23,7 @@ from .sheet import tangents
 from .sinus import build_sinus
 from .texture import smooth_patches
 from .tube import build_tube, write_tube
-from .views import pixel_hits, render_tissue, shown_elsewhere, side_eyes, side_view, visible_points
+from .views import pixel_hits, render_tissue, shown_elsewhere, side_cameras, side_view, visible_points
 
 Mask = NDArray[np.bool_]
 RED = (250, 10, 20)
@@ -172,7 +172,7 @@ def _write_cavity(writer: FrameFiles, scene: PhantomScene, outside: Mask, progre
         frame, drawn, rows = render_frame(scene, index), overlay(cfg, index), rows_after_cuts(events, index)
         if exposure is None:
             exposure = Exposure.of_first(scene, frame)
-            sides = side_eyes(float(np.median(frame.z))) if cfg.side_views else {}
+            sides = side_cameras(float(np.median(frame.z))) if cfg.side_views else {}
         gains.append(exposure.now / exposure.first)
         in_body = shows_body(events, index)
         hidden = frame.tool_mask | (outside | drawn)[rows]
@@ -242,17 +242,17 @@ def _write_truth(
     write_tissue("truth/tissue", frame.view.tissue)
     writer.write_array(f"truth/depth/{index:06d}.npy", frame.z[rows])
     if is_test_frame(index) and (scene.smoke is None or cfg.smoke):
-        write_tissue("truth/no_highlights", render_tissue(scene, frame.now, STILL, highlights=False)[0])
+        write_tissue("truth/no_highlights", render_tissue(scene, frame.now, AT_ORIGIN, highlights=False)[0])
     if cfg.overlay:
         writer.write_array(f"truth/overlay/{index:06d}.npy", overlay(cfg, index))
 
 
 def _write_sides(
-    writer: FrameFiles, scene: PhantomScene, frame: RenderedFrame, gain: float, sides: dict[str, Eye]
+    writer: FrameFiles, scene: PhantomScene, frame: RenderedFrame, gain: float, sides: dict[str, CameraPose]
 ) -> None:
     """What the side cameras see of a frame: image and depth."""
-    for name, eye in sides.items():
-        image, depth = side_view(scene, frame.now, eye, frame.z, frame.tool_mask, gain)
+    for name, pose in sides.items():
+        image, depth = side_view(scene, frame.now, pose, frame.z, frame.tool_mask, gain)
         writer.write_image(f"truth/side/{name}", image, frame.index)
         writer.write_array(f"truth/side/{name}/{frame.index:06d}.npy", depth)
 
@@ -282,14 +282,16 @@ def _deformed(scene: PhantomScene, tracked: NDArray[np.int64]) -> dict[str, NDAr
     return {name: np.stack(values).astype(np.float32) for name, values in found.items()}
 
 
-def _write_descriptions(writer: FrameFiles, scene: PhantomScene, sides: dict[str, Eye], gains: list[float]) -> None:
+def _write_descriptions(
+    writer: FrameFiles, scene: PhantomScene, sides: dict[str, CameraPose], gains: list[float]
+) -> None:
     """Poses of the cameras, the calibration of the pair, and kinds of tools and tissue, where they are not obvious."""
     cfg = scene.cfg
     if scene.path.excursions:
         writer.camera_to_world = scene.path.poses(cfg.frames)
         writer.write_array("truth/camera_to_world.npy", writer.camera_to_world)
     if sides:
-        poses = {name: eye.world_to_camera.tolist() for name, eye in sides.items()}
+        poses = {name: pose.world_to_camera.tolist() for name, pose in sides.items()}
         writer.write_json("truth/side/world_to_camera.json", poses)
     if cfg.stereo:
         (cx, cy), focal = cfg.center, cfg.focal
