@@ -9,8 +9,7 @@ def parsed(name: str, *words: str) -> object:
     if name != "bench":
         return parse(REGISTRY.load(name), words, name)
     from endoprior_studies import bench
-    from endoprior_studies.tool_training import bench as masks
 
     if words[:1] == ("masks",):
-        return parse(masks.BenchMasks, words[1:], "bench masks")
+        return parse(bench.BenchMasks, words[1:], "bench masks")
     return parse(bench.Bench, words, "bench")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -47,6 +48,15 @@ def test_the_phantom_agrees_with_its_own_tracks(sequence) -> None:
         agreed += (seen[y, x] == ever)[hidden].sum()
         counted += hidden.sum()
     assert counted > 20 and agreed / counted > 0.9
+
+
+def test_events_change_what_is_seen(tmp_path) -> None:
+    """After a cut the truth is upside down as the images are; out of the body no frame shows any tissue."""
+    cfg = PhantomConfig(frames=4, width=96, height=80, side_views=False)
+    for name, events in (("plain", ""), ("cut", "cut:1"), ("outside", "out-of-body:0-0,out-of-body:2-3")):
+        write_phantom(tmp_path / name, replace(cfg, events=events))
+    plain, cut, outside = (np.load(tmp_path / name / "truth/seen/000001.npy") for name in ("plain", "cut", "outside"))
+    assert plain.any() and np.array_equal(cut, plain[::-1]) and not outside.any()
 
 
 def test_training_frames_have_none(sequence) -> None:

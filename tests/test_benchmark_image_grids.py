@@ -120,6 +120,11 @@ def test_grids_have_a_column_for_each_method():
     assert prior_grid(FrameSequence(), scenes).shape == (height, 4 * width, 3)
 
 
+def test_the_prior_is_shown_without_any_scene_of_gaussians():
+    """Radiance fields have no centers; a benchmark of them alone has its figures all the same."""
+    assert prior_grid(FrameSequence(), {"field": object()}).shape == (6 * HEIGHT, 12 * WIDTH, 3)
+
+
 def test_sides_look_from_left_front_and_right():
     height = 6 * HEIGHT
     scenes = {"a": Still(np.zeros((1, 3))), "b": Still(np.zeros((1, 3)), shift_mm=2)}

@@ -26,8 +26,8 @@ from endoprior_baselines.endo4dgs import (
     SmallField,
     confident_error,
     gradient_correlation,
-    normal_picture,
     normals_of_depth,
+    rendered_normals,
     smallest_axes,
     without_scale,
 )
@@ -104,7 +104,7 @@ def test_normals_are_drawn_as_colors_in_a_second_pass():
     quats = torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0]])
     scales = torch.tensor([[1.0, 1, 0.1], [0.1, 1, 1]])
     drawn = []
-    normal_picture(Splats(torch.zeros(2, 3), quats, scales, torch.ones(2), sh), lambda s: drawn.append(s) or _black())
+    rendered_normals(Splats(torch.zeros(2, 3), quats, scales, torch.ones(2), sh), lambda s: drawn.append(s) or _black())
     color = drawn[0].sh[:, 0] * SH_C0 + 0.5
     torch.testing.assert_close(color, torch.tensor([[0.5, 0.5, 1], [1, 0.5, 0.5]]))
     assert torch.equal(drawn[0].sh[:, 1:], sh[:, 1:])

@@ -199,6 +199,27 @@ def test_occupied_output_is_an_error(tmp_path):
     assert [p.name for p in tmp_path.rglob("*")] == ["full", "note.txt"]
 
 
+def test_all_vertices_in_the_image_are_tracked_if_more_points_are_wanted(tmp_path):
+    write_phantom(tmp_path / "data", PhantomConfig(frames=2, width=64, height=32, tracks=20_000))
+    visible = np.load(tmp_path / "data/truth/tracks.npz")["visible"]
+    assert 5000 < visible.shape[1] < 13_000 and visible[0].mean() > 0.5
+
+
+def test_border_and_overlay_hide_points(tmp_path):
+    out = tmp_path / "data"
+    write_phantom(out, replace(SMALL, frames=2, border="octagon", overlay=True, stereo=False, tracks=2000))
+    tracks = np.load(out / "truth/tracks.npz")
+    for index in (0, 1):
+        covered = np.load(out / "truth/border.npy") | np.load(out / f"truth/overlay/{index:06d}.npy")
+        z = tracks["points"][index, :, 2]
+        pixels = (SMALL.focal * tracks["points"][index, :, :2] / z[:, None] + SMALL.center).astype(int)
+        inside = ((pixels >= 0) & (pixels < (SMALL.width, SMALL.height))).all(1)
+        x, y = pixels[inside].T
+        visible = tracks["visible"][index, inside]
+        assert covered[y, x].sum() > 50 and not visible[covered[y, x]].any()
+        assert visible[~covered[y, x]].mean() > 0.5
+
+
 INSPECT = {"camera": "inspect"}
 
 
@@ -210,6 +231,7 @@ INSPECT = {"camera": "inspect"}
         {"principal_x": 0.0}, {"tracks": 0}, {"baseline_mm": -4.2}, {"frames": 1, **INSPECT},
         {"focal_per_width": 0.6, **INSPECT}, {"width": 300, "height": 480, **INSPECT},
         {"width": 2560, "height": 1440, **INSPECT}, {"instruments": "pink"}, {"tissue": "pink"},
+        {"camera": "pink"}, {"scene": "pink"},
     ],
 )  # fmt: skip
 def test_values_out_of_range_are_input_errors(change):

@@ -13,7 +13,7 @@ from endoprior.core.geometry import bilinear
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom import scene as making
-from endoprior.phantom.camera import STILL, Eye, build_camera_path, widened
+from endoprior.phantom.camera import AT_ORIGIN, CameraPose, build_camera_path, widened
 from endoprior.phantom.graspers import JAW_MM
 from endoprior.phantom.instrument_families import instruments_of
 from endoprior.phantom.instrument_tracing import pack, render_instruments
@@ -163,8 +163,8 @@ def test_no_pose_shows_the_end_of_the_tissue(change, monkeypatch):
     scene = making.build_scene(cfg)
     for phase in np.linspace(0, 1, 26):
         vertices = scene.seen_vertices(phase)
-        for eye in (STILL, Eye.moved(cfg.baseline_mm)):
-            z = rasterize(eye.sees(vertices), cfg.focal, cfg.center, cfg.width, cfg.height)[..., 2]
+        for eye in (AT_ORIGIN, CameraPose.moved_right(cfg.baseline_mm)):
+            z = rasterize(eye.to_camera(vertices), cfg.focal, cfg.center, cfg.width, cfg.height)[..., 2]
             assert z.max() < FAR and 30 < z.min() and 45 < np.median(z) < 130
 
 
@@ -194,12 +194,12 @@ def test_a_tool_in_the_world_closed_form(moved):
     numbers = pack(pose, tools[0], 0, 0).astype(float)
     wrist, back = numbers[:3], numbers[3:6]
     turn = cv2.Rodrigues(np.array([0.1, -0.15, 0.2]))[0]
-    endoscope = Eye(np.array([8.0, -5.0, -12.0]), turn) if moved else STILL
+    endoscope = CameraPose(np.array([8.0, -5.0, -12.0]), turn) if moved else AT_ORIGIN
     wall, z = np.zeros((80, 96, 3), np.float32), np.full((80, 96), 120, np.float32)
     color, depth = render_instruments(poses, tools, 0, wall, z, *where, endoscope)
     y, x = np.nonzero(depth < FAR)
     points = np.stack([(x + 0.5 - 48) / 80, (y + 0.5 - 40.5) / 80, np.ones(len(x))], -1) * depth[y, x, None]
-    world = points @ endoscope.turn.T + endoscope.center
+    world = points @ endoscope.rotation.T + endoscope.center
     along = (world - wrist) @ back
     radial = np.linalg.norm(world - wrist - along[:, None] * back, axis=-1)
     # Tracing stops 0.012 mm from the surface.
@@ -217,10 +217,10 @@ def standing():
 
 def tissue_from(scene, pose):
     """Radiance and z of the tissue in the first frame, seen from `pose` (4, 4)."""
-    endoscope = Eye(pose[:3, 3], pose[:3, :3])
-    vertices = endoscope.sees(scene.vertices(0.0))
-    now = making.Moment(endoscope, vertices, vertex_normals(vertices), scene.motion.tools(0.0))
-    return render_tissue(scene, now, STILL)
+    endoscope = CameraPose.of(pose)
+    vertices = endoscope.to_camera(scene.vertices(0.0))
+    now = making.SceneState(endoscope, vertices, vertex_normals(vertices), scene.motion.tools(0.0))
+    return render_tissue(scene, now, AT_ORIGIN)
 
 
 def test_light_comes_with_the_camera(standing):

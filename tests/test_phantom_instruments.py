@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.camera import STILL, Eye
+from endoprior.phantom.camera import AT_ORIGIN, CameraPose
 from endoprior.phantom.config import Instruments
 from endoprior.phantom.instrument_families import instruments_of
 from endoprior.phantom.instrument_shapes import SHAFT, distance
 from endoprior.phantom.instrument_tracing import pack, render_instruments
 from endoprior.phantom.motion import ToolPose
 from endoprior.phantom.raster import FAR
-from endoprior.phantom.scene import Moment, build_scene
+from endoprior.phantom.scene import SceneState, build_scene
 from endoprior.phantom.views import render_view
 
 SMALL = PhantomConfig(frames=48, width=96, height=80, seed=3)
@@ -43,7 +43,7 @@ def scene(all_vessels):
 def seen(scene, family, phase=0.5, seed=0):
     """What the left camera sees of the scene with a family's tools."""
     scene = replace(scene, instruments=instruments_of(family, seed))
-    return render_view(scene, Moment.of(scene, phase), STILL)
+    return render_view(scene, SceneState.of(scene, phase), AT_ORIGIN)
 
 
 def drawn(tool, pose=ACROSS, color=(0.4, 0.1, 0.1), size=(80, 96), z=90.0):
@@ -63,7 +63,7 @@ def test_the_default_has_the_tools_and_the_tissue_it_had(all_vessels):
     assert built.motion.hover[:3].tolist() == DEFAULT_HOVER
     texture = built.texture.reshape(-1, 7).mean(0, dtype=float)[[0, 1, 2, 5, 6]]
     assert texture == pytest.approx(DEFAULT_TEXTURE, rel=1e-5)
-    view = render_view(built, Moment.of(built, 0.5), STILL)
+    view = render_view(built, SceneState.of(built, 0.5), AT_ORIGIN)
     means = *view.tissue.mean((0, 1)), *view.image.mean((0, 1)), view.tool_share.mean()
     found = [*means, view.tool_depth[view.tool_depth < FAR].mean()]
     assert found == pytest.approx(DEFAULT_VIEW, rel=1e-3)  # samples at rims depend on the CPU
@@ -163,15 +163,15 @@ def test_a_tapered_tube_and_a_bar_are_never_farther_than_they_say():
 
 
 def test_a_tool_at_rest_in_the_world_stays_when_the_camera_turns():
-    turned = Eye(np.array([1.0, 2.0, 3.0]), cv2.Rodrigues(np.array([0.0, 0.0, np.pi / 2]))[0])
+    turned = CameraPose(np.array([1.0, 2.0, 3.0]), cv2.Rodrigues(np.array([0.0, 0.0, np.pi / 2]))[0])
     tool = instruments_of("gray_blue", 0)[0]
     size, still = (96, 96), np.zeros(3, np.float32)
     wall, z = np.zeros((*size, 3), np.float32), np.full(size, 90, np.float32)
-    there = [ToolPose(turned.turn @ p + turned.center, turned.turn @ q + turned.center, 0.3, 0.0)
+    there = [ToolPose(turned.rotation @ p + turned.center, turned.rotation @ q + turned.center, 0.3, 0.0)
              for p, q in ((ACROSS.pivot, ACROSS.tip),)]  # fmt: skip
     depth = [
         render_instruments((pose,), (tool,), 0, wall, z, still, 80.0, (48.0, 48.0), eye)[1] < FAR
-        for pose, eye in ((ACROSS, STILL), (there[0], turned))
+        for pose, eye in ((ACROSS, AT_ORIGIN), (there[0], turned))
     ]
     # The wrist bends towards the line of sight of the first camera, so the jaws differ a little.
     assert (depth[0] ^ depth[1]).mean() < 0.02 and depth[0].mean() > 0.05

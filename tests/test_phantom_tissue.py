@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.camera import STILL, Eye
+from endoprior.phantom.camera import AT_ORIGIN, CameraPose
 from endoprior.phantom.config import Tissue
 from endoprior.phantom.raster import FAR
-from endoprior.phantom.scene import Moment, Smoke, build_scene
+from endoprior.phantom.scene import SceneState, Smoke, build_scene
 from endoprior.phantom.sensor import develop, exposure_gain, metered, next_gain, vignette
 from endoprior.phantom.surface import build_anatomy, organs_at
 from endoprior.phantom.texture import LOOKS, bled
@@ -32,7 +32,7 @@ def scenes():
 @pytest.fixture(scope="module")
 def views(scenes):
     """What the left camera sees in the first frame."""
-    return {kind: render_view(scene, Moment.of(scene, 0.0), STILL) for kind, scene in scenes.items()}
+    return {kind: render_view(scene, SceneState.of(scene, 0.0), AT_ORIGIN) for kind, scene in scenes.items()}
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +103,13 @@ def test_smoke_comes_and_goes(scenes):
 
 def test_smoke_veils_tissue_and_tools_alike_and_drifts(scenes):
     scene, times = scenes["smoke"], (0.40, 0.48)
-    clear = [render_view(replace(scene, smoke=None), Moment.of(scene, t), STILL) for t in times]
-    veiled = [render_view(scene, Moment.of(scene, t), STILL) for t in times]
+    clear = [render_view(replace(scene, smoke=None), SceneState.of(scene, t), AT_ORIGIN) for t in times]
+    veiled = [render_view(scene, SceneState.of(scene, t), AT_ORIGIN) for t in times]
     for before, after in zip(clear, veiled, strict=True):
         tool = before.tool_share == 1
         assert np.array_equal(before.tool_share, after.tool_share)
         lost, at = {}, times[0] if after is veiled[0] else times[1]
-        want = scene.smoke.veiled(before.image, before.tool_depth, at, STILL, SMALL.focal, SMALL.center)
+        want = scene.smoke.veiled(before.image, before.tool_depth, at, AT_ORIGIN, SMALL.focal, SMALL.center)
         error = np.abs(after.image - want)[tool] / np.abs(want - before.image)[tool].mean()
         assert np.median(error) < 0.04  # clouds are sampled more coarsely at this size
         for name, where in (("tool", tool), ("tissue", before.tool_share == 0)):
@@ -123,7 +123,7 @@ def test_smoke_closed_form():
     # By the law of Beer and Lambert, twice the way lets the square through.
     smoke = Smoke.of(SMALL, 0.6)
     black = np.zeros((32, 32, 3), np.float32)
-    eye, grid = Eye.moved(0.0), (40.0, (16.0, 16.0))
+    eye, grid = CameraPose.moved_right(0.0), (40.0, (16.0, 16.0))
     near, far = (smoke.veiled(black, np.full((32, 32), z, np.float32), 0.45, eye, *grid) for z in (40.0, 80.0))
     unit = far[..., 0] / far[..., 0].max()
     assert (far > near).all() and unit.std() > 0.01
@@ -167,11 +167,11 @@ def test_a_liver_is_liver_everywhere(scenes):
 
 def test_smoke_option_veils_images_and_leaves_the_truth_clear():
     plain, smoky = (build_scene(replace(SMALL, smoke=share)) for share in (0.0, 0.66))
-    before, after = (render_view(scene, Moment.of(scene, 0.45), STILL) for scene in (plain, smoky))
+    before, after = (render_view(scene, SceneState.of(scene, 0.45), AT_ORIGIN) for scene in (plain, smoky))
     assert np.array_equal(before.tissue, after.tissue)
     assert np.abs(before.image - after.image).mean() > 0.05
     kind = build_scene(replace(SMALL, tissue="smoke"))
-    assert np.array_equal(render_view(kind, Moment.of(kind, 0.45), STILL).image, after.image)
+    assert np.array_equal(render_view(kind, SceneState.of(kind, 0.45), AT_ORIGIN).image, after.image)
 
 
 def test_automatic_gain_follows_brightness_with_a_lag():

@@ -62,6 +62,7 @@ def test_scores_of_images_and_reasons_for_the_rest(tmp_path, sequence):
     assert result.skipped["depth_rmse_mm"] == NO_DEPTH
     assert result.skipped["flow_error_dis_adjacent"] == "needs more frames: there is no image of frame 0"
     assert not result.scores.keys() & result.skipped.keys()
+    assert not {"track_error_mm", "range_held_95", "ate_mm"} & result.skipped.keys()  # there is no ground truth
     assert [row["index"] for row in result.per_frame] == TEST and "psnr" in result.per_frame[0]
     assert "backend" not in result.protocol and result.protocol["frames"] == TEST
 

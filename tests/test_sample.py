@@ -10,7 +10,7 @@ import pytest
 from endoprior.cli import main
 from endoprior.cli.sample import write_sample
 from endoprior.data import load_sequence
-from endoprior.phantom.camera import Eye
+from endoprior.phantom.camera import CameraPose
 from endoprior.phantom.raster import FAR, rasterize
 from endoprior.phantom.sample import RECORDED, SampleConfig, phantom_of, rays_of, sample_frames
 from endoprior.phantom.scene import build_scene
@@ -65,7 +65,7 @@ def test_points_are_where_the_calibration_says(tmp_path, monkeypatch):
         cfg = scene.cfg
         y, x = np.mgrid[: cfg.height, : cfg.width] + 0.5
         image = np.full((cfg.height, cfg.width, 3), 0.02, np.float32)
-        for point in eye.sees(BEADS):
+        for point in eye.to_camera(BEADS):
             u, v = cfg.focal * point[:2] / point[2] + cfg.center
             image += np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8)[..., None].astype(np.float32) * 0.1
         return RenderedView(image, image, image[..., 0] * 0, image[..., 0] * 0)
@@ -142,7 +142,7 @@ def test_prepared_it_has_the_true_depth(tmp_path, capsys):
         frame, vertices = sequence.frame(index), scene.vertices(index / (cfg.frames - 1))
         camera = frame.camera
         assert abs(camera.fx / camera.fy - 1) < 1e-3
-        seen = Eye(np.zeros(3), turn.T).sees(vertices)
+        seen = CameraPose(np.zeros(3), turn.T).to_camera(vertices)
         z = rasterize(seen, camera.fx, (camera.cx, camera.cy), camera.width, camera.height)[..., 2]
         known = frame.tissue_mask & frame.depth_valid & (z < FAR)
         error = np.abs(frame.depth - z)[known]

@@ -15,7 +15,7 @@ from endoprior.data import load_sequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.scorers import other_views
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.views import side_eyes
+from endoprior.phantom.views import side_cameras
 
 NAMES = {"left20", "left10", "right10", "right20", "aside15"}
 
@@ -29,12 +29,12 @@ def folder(tmp_path_factory):
 
 
 def test_cameras_turn_about_the_pivot_and_look_at_it():
-    for name, eye in side_eyes(70.0).items():
-        pivot = eye.sees(np.array([0.0, 0.0, 70.0]))
+    for name, eye in side_cameras(70.0).items():
+        pivot = eye.to_camera(np.array([0.0, 0.0, 70.0]))
         assert np.allclose(pivot, (-15, 0, 70) if name == "aside15" else (0, 0, 70))
-        assert np.allclose(eye.world_to_camera @ (1.0, 2.0, 60.0, 1.0), [*eye.sees(np.array([1.0, 2.0, 60.0])), 1])
+        assert np.allclose(eye.world_to_camera @ (1.0, 2.0, 60.0, 1.0), [*eye.to_camera(np.array([1.0, 2.0, 60.0])), 1])
         assert (eye.center[0] > 0) == (name in ("right10", "right20", "aside15"))
-    right = side_eyes(70.0)["right20"]
+    right = side_cameras(70.0)["right20"]
     assert np.allclose(right.center, (70 * np.sin(np.deg2rad(20)), 0, 70 * (1 - np.cos(np.deg2rad(20)))))
 
 

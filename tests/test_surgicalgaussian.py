@@ -20,7 +20,7 @@ from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
-from endoprior_baselines.surface_points import grid_points
+from endoprior_baselines.released import grid_points
 from endoprior_baselines.surgicalgaussian import (
     METHOD,
     TimeNetwork,

@@ -28,7 +28,7 @@ from endoprior.model.motion import Field, ModelOps, Motion
 from endoprior.training.optimizer import Rate, rate_of
 
 from .learned_basis import COEFFICIENTS, value_at
-from .surface_points import Released, enough, surface_points
+from .released import Released, enough, surface_points
 
 NUM_BASES = 17
 """Basis functions of each Gaussian and channel."""

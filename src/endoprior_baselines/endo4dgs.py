@@ -30,7 +30,7 @@ from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
-from .surface_points import Released, grid_points
+from .released import Released, grid_points
 
 EVERY_PX = 2
 """A point starts at every second pixel along both axes; the release takes all, a quarter of a million."""
@@ -95,7 +95,7 @@ class Endo4DGS(Released):
         z = out.depth / out.alpha.clamp(min=MIN_CONFIDENCE)
         known, valid = frame.depth, frame.measured & (z > 0)
         depth, target = without_scale(z, valid), without_scale(known, valid)
-        facing = (normal_picture(drawn.splats, drawn.render) * normals_of_depth(known)).sum(-1)
+        facing = (rendered_normals(drawn.splats, drawn.render) * normals_of_depth(known)).sum(-1)
         trust = out.alpha.detach()
         picture = confident_error(out.color[frame.tissue_mask], frame.rgb[frame.tissue_mask], trust[frame.tissue_mask])
         surface = confident_error(depth[valid][:, None], target[valid][:, None], trust[valid])
@@ -161,10 +161,10 @@ def smallest_axes(splats: Splats) -> Tensor:
     return axes[torch.arange(len(axes), device=axes.device), splats.scales.argmin(1)]
 
 
-def normal_picture(splats: Splats, draw: Callable[[Splats], RenderOutput]) -> Tensor:
-    """(H, W, 3) the thinnest axes n drawn as colors (n + 1) / 2; color of higher degrees stays in, as released."""
+def rendered_normals(splats: Splats, render: Callable[[Splats], RenderOutput]) -> Tensor:
+    """(H, W, 3) the thinnest axes n rendered as colors (n + 1) / 2; color of higher degrees stays in, as released."""
     first = (((smallest_axes(splats) + 1) / 2 - 0.5) / SH_C0)[:, None]
-    return draw(replace(splats, sh=torch.cat([first, splats.sh[:, 1:]], 1), color_slopes=None)).color
+    return render(replace(splats, sh=torch.cat([first, splats.sh[:, 1:]], 1), color_slopes=None)).color
 
 
 def confident_error(value: Tensor, target: Tensor, confidence: Tensor) -> Tensor:

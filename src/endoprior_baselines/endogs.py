@@ -34,7 +34,7 @@ from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
-from .surface_points import Released
+from .released import Released
 
 UNIT_MM = 10.0
 """Unit of length of what the network gives. COLMAP's, which is any; with this one a scene 10 cm wide has the extent 5
@@ -52,7 +52,7 @@ OFTEN_HIDDEN = 30.0
 DEPTH_WEIGHT, HUBER_DELTA, DEPTH_EPSILON = 0.5, 0.2, 1e-5
 TV_WEIGHT = 0.01
 PLANE_WEIGHTS = PlaneWeights(space=1e-3, time=1e-3, ones=2e-2)
-PRUNE_EVERY, RESET_EVERY, FIRST_RESET = 7000, 6000, 500
+PRUNE_EVERY, RESET_EVERY = 7000, 6000
 MAX_SCALE_SHARE = 0.1
 """After the opacity reset at 6,000 larger Gaussians go; share of the extent.
 
@@ -116,6 +116,7 @@ class EndoGS(Released):
     background = (1.0, 1.0, 1.0)
     keeps_optimizer = True
     growth_ends, last_reset = 0.75, 0.7
+    first_reset, reset_every = 500, RESET_EVERY
     name = "endogs"
     way = JointMotion()
     changes: ClassVar[Mapping[str, Any]] = {  # published: 3,000 and 60,000 iterations
@@ -180,12 +181,6 @@ class EndoGS(Released):
         split = grow & ~small
         rules = {"opacity": faint, "size": large}
         return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split, removed_by=rules)
-
-    @override
-    def released_reset_due(self, iteration: int, cfg: Config) -> bool:
-        """The first one belongs to the white background."""
-        inside = iteration < cfg.density.stop_iteration
-        return inside and (iteration == FIRST_RESET or iteration % RESET_EVERY == 0)
 
 
 def depth_huber(depth: Tensor, target: Tensor, measured: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_line
 from endoprior.training.state import Drawn
 from endoprior.training.trainer import Stage
 
-from .surface_points import Released, grid_points
+from .released import Released, grid_points
 
 PLACE_BANDS, TIME_BANDS = 10, 4
 WIDTH, DEPTH, SKIP_AFTER = 256, 8, 4
@@ -125,7 +125,7 @@ EVERY_PX, FIRST_PX = 3, 1
 COLOR_SHARE, TV_WEIGHT, DEPTH_WEIGHT = 0.8, 0.02, 0.001
 DISTANCE_WEIGHT, SHAPE_WEIGHT, NUM_NEIGHBORS = 0.2, 40.0, 4
 """Weights of the sequence `cutting`; those of `pulling` are 0. The release asks for five neighbors and drops itself."""
-RESET_EVERY, FIRST_RESET = 3000, 500
+RESET_EVERY = 3000
 MAX_SCALE = 0.1
 """After the reset of opacities at 3,000 larger Gaussians go; units of length.
 
@@ -192,6 +192,7 @@ class SurgicalGaussian(Released):
     background = (1.0, 1.0, 1.0)
     first_share = 1 / EVERY_PX**2
     growth_ends, last_reset = 0.375, 0.3
+    first_reset, reset_every = 500, RESET_EVERY
     name = "surgicalgaussian"
     way = NetworkMotion()
     changes: ClassVar[Mapping[str, Any]] = {  # published: 40,000 iterations, growth before 15,000, decay over 30,000
@@ -246,17 +247,11 @@ class SurgicalGaussian(Released):
         rules = {**planned.removed_by, "size": large}
         return Plan(clone=planned.clone & ~large, split=planned.split, remove=planned.remove | large, removed_by=rules)
 
-    @override
-    def released_reset_due(self, iteration: int, cfg: Config) -> bool:
-        """The first one belongs to the white background."""
-        inside = iteration < cfg.density.stop_iteration
-        return inside and (iteration == FIRST_RESET or iteration % RESET_EVERY == 0)
-
 
 def neighbor_terms(gaussians: Gaussians, offsets: Offsets, splats: Splats) -> dict[str, Tensor]:
     """How much the distances between neighbors, and those between their covariances, differ from the canonical ones.
 
-    As released, the deformed covariance has the raw quaternion plus its offset, not the one that is drawn.
+    As released, the deformed covariance has the raw quaternion plus its offset, not the one that is rendered.
     """
     means, quats = gaussians["means"], gaussians["quats"]
     found, _ = nearest(means.detach().cpu().numpy(), min(NUM_NEIGHBORS, len(means) - 1))

@@ -1,4 +1,4 @@
-"""`endoprior bench SPEC OUT`."""
+"""`endoprior bench SPEC OUT`, `endoprior bench masks OUT`, and the help page of a spec: `bench SPEC --help`."""
 
 from __future__ import annotations
 
@@ -6,20 +6,23 @@ import os
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from endoprior.cli.arguments import Command, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
-
-from .tool_training import bench as bench_masks
+from endoprior.system.installation import page
 
 if TYPE_CHECKING:
-    from .spec import Spec
+    from .spec import SequenceSpec, Spec
 
 MAX_CORES = 4096
 """Largest --cores and --threads."""
 MAX_ITERATIONS = 10_000_000
+DATA_ROOT = "$ENDOPRIOR_DATA/"
+"""Paths of sequences that a user has to have begin with it."""
+PAGE_WIDTH = 80
 
 
 @dataclass
@@ -67,9 +70,9 @@ class Bench(Command):
 def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
     if argv[:1] == ["masks"]:
-        return bench_masks.run(argv[1:])
-    if page := _page(argv):
-        say(page)
+        return run_masks(argv[1:])
+    if words := _page(argv):
+        say(words)
         return 0
     args = parse(Bench, argv, "bench")
     from endoprior.cli.paths import require_writable_folder
@@ -124,7 +127,6 @@ def _page(argv: list[str]) -> str:
     if first.startswith("-") or not {"-h", "--help"} & {*rest}:
         return ""
     from .spec_file import find_spec
-    from .spec_page import spec_page
 
     return spec_page(first, find_spec(first))
 
@@ -163,3 +165,112 @@ def _chosen(args: Bench, source: Path, folders: dict[str, Path]) -> dict[Path, S
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def spec_page(name: str, source: Path) -> str:
+    """What the spec of a name, or the specs of its folder, need and take. Args: source: its file or folder."""
+    from .spec_file import load_spec, specs_of
+
+    specs = {path: load_spec(path) for path in specs_of(source)}
+    own: dict[str, str] = {}
+    for spec in specs.values():
+        own = {data: _words(spec, data) for data, each in spec.sequences.items() if each.path} | own
+    methods = sorted({method for spec in specs.values() for method in spec.methods})
+    lines = [f"usage: endoprior bench {name} OUT{' [--data NAME=FOLDER ...]' if own else ''} [options]", ""]
+    width = max(len(path.stem) for path in specs)
+    for path, spec in specs.items():
+        lines += _wrapped(f"  {name}/{path.stem:<{width}}  " if source.is_dir() else "", spec.title)
+    if own:
+        lines += ["", "names for --data; those that you leave out are looked for in $ENDOPRIOR_DATA:"]
+        width = max(map(len, own))
+        for data, words in own.items():
+            lines += _wrapped(f"  {data:<{width}}  ", words)
+    lines += ["", *_wrapped("names for --methods: ", ", ".join(methods))]
+    given = " ".join(["--data", *(f"{data}=FOLDER" for data in list(own)[:2])]) if own else "--estimate"
+    lines += ["", f"All options: `endoprior bench --help`. The page: {page('benchmarks.md')}"]
+    lines += ["", "examples:", f"  endoprior bench {name} OUT {given}"]
+    if own:
+        lines.append(f"  endoprior bench {name} OUT {given} --estimate")
+    return "\n".join(lines)
+
+
+def _words(spec: Spec, name: str) -> str:
+    """What the folder of a sequence is: the data it belongs to, its place there, layout and frames."""
+    sequence, about = spec.sequences[name], spec.published
+    parts = [f"{about.data}: {_place(sequence)}" if about else _place(sequence)]
+    if about and name in about.frames:
+        parts.append(f"{about.frames[name]} frames")
+    if sequence.format == "scared":
+        parts.append("the folder that holds data/")
+    elif sequence.format != "auto":
+        parts.append(f"layout {sequence.format}")
+    if sequence.stride > 1:
+        parts.append(f"1 frame of {sequence.stride} is used")
+    return ", ".join(parts)
+
+
+def _place(sequence: SequenceSpec) -> str:
+    """The folder as its dataset calls it."""
+    known = sequence.path.removeprefix(DATA_ROOT)
+    return known.partition("/")[2] or f"a sequence folder, {sequence.path}"
+
+
+def _wrapped(head: str, words: str) -> list[str]:
+    return wrap(words, PAGE_WIDTH, initial_indent=head, subsequent_indent=" " * (len(head) or 2))
+
+
+@dataclass
+class BenchMasks(Command):
+    """Train the network that finds tools without each set of real frames, and score it on that set.
+
+    A network takes hours. Networks in OUT are kept, and an interrupted training resumes. The clips are read from
+    the folder that the environment variable ENDOPRIOR_DATA names.
+    """
+
+    out: Path = field(metadata={"place": "OUT"})
+    """Folder for networks, phantoms and the report."""
+    steps: int = 8000
+    """Training steps of each network, of 16 images each."""
+    seed: int = 0
+    """Seed of weights and examples."""
+    pretrained: Path | None = None
+    """Weights of EfficientNet-Lite0 that each network starts from (docs/tool_network.md); random without them."""
+    write_weights: Path | None = None
+    """Also write the weights of the network that was trained with all sets to this file."""
+
+    examples = ("OUT", "OUT --steps 500")
+
+
+def run_masks(argv: list[str]) -> int:
+    """Train and score the networks, and write the report."""
+    args = parse(BenchMasks, argv, "bench masks")
+    if not 1 <= args.steps <= 10**6:
+        raise input_error("--steps", "1 to 1000000", f"{args.steps}", "Choose a value in this range.")
+    root = Path(os.environ.get("ENDOPRIOR_DATA", ""))
+    if not (root / "vocalfolds").is_dir():
+        fix = "ENDOPRIOR_DATA=FOLDER with bowel_lift/, vocalfolds/, mono_endo.mp4 and wild/ (docs/tool_network.md)."
+        raise input_error("ENDOPRIOR_DATA", "the folder of the clips", repr(str(root)), f"Set {fix}")
+    from endoprior.cli.paths import require_writable_folder
+    from endoprior.system.file_lock import locked
+
+    from .tool_training.fit import pretrained
+    from .tool_training.leave_one_out import ALL, Training, rows, weights_file, write_report
+
+    require_writable_folder("OUT", args.out)
+    start = pretrained(args.pretrained, args.seed) if args.pretrained else None
+    args.out.mkdir(parents=True, exist_ok=True)
+    with locked(args.out, args.out / ".lock"):
+        table = []
+        for row in rows(args.out, root, Training(args.steps, args.seed, start), say):
+            say(f"{row.name}: {', '.join(f'{k} {v:.3f}' for k, v in row.score.total.scores().items())}")
+            table.append(row)
+        settings = {
+            "steps": args.steps,
+            "seed": args.seed,
+            "pretrained": args.pretrained.name if args.pretrained else "no",
+        }
+        report = write_report(args.out, table, settings)
+        if args.write_weights:
+            args.write_weights.write_bytes(weights_file(args.out, ALL).read_bytes())
+    say(f"report: {report}")
+    return 0

@@ -229,7 +229,7 @@ def prior_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDA
     frame = sequence.frame(0)
     rho = joint_texture_prior(frame.rgb, frame.tissue_mask)
     densities = {name: center_density(scene, frame) for name, scene in scenes.items() if isinstance(scene, Scene)}
-    top = max(float(np.percentile(density, 99.5)) for density in densities.values())
+    top = max((float(np.percentile(density, 99.5)) for density in densities.values()), default=0.0)
     tiles = [_labeled(frame.rgb_u8, "input"), _labeled(colorize(rho, 0, 1), "prior")]
     tiles += [_labeled(colorize(d, 0, top), f"centers, {name}") for name, d in densities.items()]
     return tile(tiles, len(tiles))

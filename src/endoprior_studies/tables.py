@@ -295,9 +295,9 @@ def _of_this_run(matrix: Matrix, about: PublishedSpec) -> list[str]:
             texts.append("{}: {} x {} pixels; published: {} x {}".format(name, *size, *about.size))
     texts.append(f"Seeds here: {', '.join(map(str, spec.seeds))}; published: not said")
     done = [scores_of(folder) for folder in matrix.done.values()]
-    protocols, skipped = [one["protocol"] for one in done], dict[str, str]()
+    protocols, skipped, published = [one["protocol"] for one in done], dict[str, str](), rows_of(FIGURES)[0]
     for one in done:
-        skipped |= {score: why for score, why in one["skipped"].items() if score in rows_of(FIGURES)[0]}
+        skipped |= {score: why for score, why in one["skipped"].items() if score in published}
     for text in dict.fromkeys(protocol["split_rule"] for protocol in protocols):
         texts.append(f"Split here: {text}; published: 7:1 at a fixed interval")
     for backend, fps in dict.fromkeys((p["backend"], p["fps"].split("; ")[-1]) for p in protocols if "backend" in p):

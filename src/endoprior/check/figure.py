@@ -22,8 +22,7 @@ from ..core.types import Frame
 from ..data import FrameSequence
 from ..footage.depth_unit import FAR_MM, NEAR_MM
 from ..footage.overlays import find_strokes
-from ..visualization.figures import save_figure
-from ..visualization.image_tools import colorize
+from ..visualization.image_tools import colorize, save_figure
 from .facts import Facts
 from .findings import SEEN_AS_TISSUE, Finding
 from .report import table, unit_reason

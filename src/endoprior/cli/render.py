@@ -82,7 +82,7 @@ class Render(Command):
         from ..model.scene import with_gaussians
         from ..system.atomic import removed_on_failure
         from ..visualization.rendered_views import depth_span, read_path, sway_path, times_path, write_views
-        from ..visualization.tissue_layers import SupportMap, write_support_film, write_texture_film
+        from ..visualization.tissue_layers import SupportMap, write_support_video, write_texture_video
 
         run, frames = folder_of(self.run), None
         require_writable_folder("OUT" if self.out else "RUN", self.out or run)
@@ -108,10 +108,10 @@ class Render(Command):
             if self.layer == "color":
                 write_views(scene, views, out, video, frames, smoke=self.smoke)
             elif self.layer == "texture":
-                write_texture_film(with_gaussians(scene, self.run), views, images, video, frames)
+                write_texture_video(with_gaussians(scene, self.run), views, images, video, frames)
             else:
                 support = SupportMap(with_gaussians(scene, self.run), sequence().training_part)
-                write_support_film(support, views, images, video, scene.frames_per_second, frames)
+                write_support_video(support, views, images, video, scene.frames_per_second, frames)
         if (others := len(list(images.glob("*.png"))) - len(views)) > 0:
             say(f"note: other images were in {images} before: {others}")
         say(f"{len(views)} frames: {out if self.layer == 'color' else images}\nvideo: {video}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,14 +14,11 @@ from ..core.checks import input_error
 from ..core.geometry import length_unit
 from ..core.ranges import evenly_spaced
 from ..core.types import Splats
-from ..model.scene import Scene
+from ..model.scene import RenderedScene, Scene, with_gaussians
 from ..system.atomic import whole_file, whole_folder, write_json
 from .axes import ROTATIONS, rotated
 from .formats import REGISTRY, ExportFormat, ExportOptions, Files, Progress, formats_of, load_format, usable_formats
 from .time_steps import TimeStep, selected_time_steps
-
-if TYPE_CHECKING:
-    from ..model.scene import RenderedScene
 
 
 def format_name(out: Path, options: ExportOptions) -> str:
@@ -60,8 +56,6 @@ def export(
         >>> [file.name for file in files]
         ['tissue.ply']
     """
-    from ..model.scene import with_gaussians  # which takes long to import
-
     scene, out, options = with_gaussians(scene), Path(out), options or ExportOptions()
     name = format_name(out, options)
     chosen = load_format(name)
@@ -98,8 +92,6 @@ def _by_suffix(out: Path, options: ExportOptions, chosen: ExportFormat) -> str:
 def _write_time_steps(
     scene: Scene, out: Path, options: ExportOptions, chosen: ExportFormat, files: Files, progress: Progress
 ) -> None:
-    from .time_steps import selected_time_steps  # which takes long to import
-
     steps, name = selected_time_steps(scene, options), str(options.format)
     if same_suffix := formats_of(out.suffix):
         _check_file(out, chosen.suffixes, name)

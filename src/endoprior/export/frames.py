@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..core.geometry import camera_to_world
 from ..core.shell import command
 from ..core.types import Camera
 from ..data.images import encode_png
@@ -67,7 +68,7 @@ def write_tum(scene: Scene, out: Path, options: ExportOptions, progress: Progres
     """Write the path of the camera as the TUM RGB-D benchmark has it: `time x y z qx qy qz qw`, s and m."""
     steps = selected_time_steps(scene, options)
     seconds = [step.time * len(scene.cameras) / scene.frames_per_second for step in steps]
-    poses = _camera_to_world(scene, steps)
+    poses = _poses(scene, steps)
     rows = np.column_stack([seconds, poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat()])
     write_text(out, f"# time x y z qx qy qz qw: {_about(scene)}\n{_lines(rows)}")
     progress(1, 1)
@@ -75,7 +76,7 @@ def write_tum(scene: Scene, out: Path, options: ExportOptions, progress: Progres
 
 def write_kitti(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
     """Write the path of the camera as KITTI's odometry benchmark has it: the 3x4 pose row by row in each line, m."""
-    poses = _camera_to_world(scene, selected_time_steps(scene, options))
+    poses = _poses(scene, selected_time_steps(scene, options))
     write_text(out, _lines(poses.reshape(-1, 12)))  # its readers take no comments
     progress(1, 1)
 
@@ -90,9 +91,9 @@ def _about(scene: Scene) -> str:
     return f"camera to world, OpenCV axes, {unit}, of the frames after rectification"
 
 
-def _camera_to_world(scene: Scene, steps: list[TimeStep]) -> NDArray[np.float64]:
-    """(T, 3, 4) poses, m."""
-    poses = np.array([np.linalg.inv(step.camera(scene).world_to_camera)[:3] for step in steps], np.float64)
+def _poses(scene: Scene, steps: list[TimeStep]) -> NDArray[np.float64]:
+    """(T, 3, 4) camera-to-world, m."""
+    poses = camera_to_world(step.camera(scene) for step in steps)[:, :3]
     poses[:, :, 3] /= MM_PER_M
     return poses
 

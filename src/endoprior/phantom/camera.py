@@ -30,33 +30,38 @@ _PAD_MM = 6.0
 
 
 @dataclass(frozen=True)
-class Eye:
-    """A camera in outer axes: of the world for the endoscope's left one, for others of the left one in that frame."""
+class CameraPose:
+    """Where a camera is, in outer axes: of the world for the endoscope's left camera, of that one for all others."""
 
     center: NDArray[np.float64]
     """(3,) mm."""
-    turn: NDArray[np.float64]
+    rotation: NDArray[np.float64]
     """(3, 3) rotation of the camera's axes to the outer ones."""
 
     @staticmethod
-    def moved(x_mm: float) -> Eye:
-        """A camera moved to the right."""
-        return Eye(np.array([x_mm, 0.0, 0.0]), np.eye(3))
+    def of(camera_to_world: NDArray[np.float64]) -> CameraPose:
+        """The pose of a (4, 4) matrix."""
+        return CameraPose(camera_to_world[:3, 3], camera_to_world[:3, :3])
 
-    def sees(self, points: NDArray) -> NDArray[np.float64]:
+    @staticmethod
+    def moved_right(x_mm: float) -> CameraPose:
+        """A camera with the outer axes, moved along x."""
+        return CameraPose(np.array([x_mm, 0.0, 0.0]), np.eye(3))
+
+    def to_camera(self, points: NDArray) -> NDArray[np.float64]:
         """Points (..., 3) of the outer axes in the axes of this camera, mm."""
-        return (points - self.center) @ self.turn
+        return (points - self.center) @ self.rotation
 
     @property
     def world_to_camera(self) -> NDArray[np.float64]:
         """(4, 4) rigid transform from the outer axes."""
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.turn.T, -self.turn.T @ self.center
+        pose[:3, :3], pose[:3, 3] = self.rotation.T, -self.rotation.T @ self.center
         return pose
 
 
-STILL = Eye.moved(0.0)
-"""A camera where the outer axes are."""
+AT_ORIGIN = CameraPose.moved_right(0.0)
+"""A camera at the origin of the outer axes, turned like them."""
 
 
 @dataclass(frozen=True)

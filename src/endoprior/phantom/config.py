@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from ..core.checks import input_error, or_did_you_mean
 from .events import parse_events
@@ -19,10 +19,7 @@ WIDEST_MOVING = 0.75
 Instruments = Literal[
     "graspers", "gray_blue", "black", "white_plastic", "steel", "gold", "green", "blue", "mixed"
 ]  # fmt: skip
-Gain = Literal["fixed", "auto"]
 Tissue = Literal["bowel", "pale", "fat", "purple", "liver", "warm", "smoke", "blood"]
-Mechanics = Literal["none", "pull", "poke", "breathe"]
-Border = Literal["none", "octagon", "oval", "rounded"]
 
 NARROW_PULL_MM = 15.0
 """Up to this pull, mm, the moved neighborhood keeps its size; beyond, it grows in proportion, or tissue would fold."""
@@ -57,14 +54,14 @@ class PhantomConfig:
     """Kind of tissue and view: its color, vessels and gloss; `warm` light; `smoke` that comes and goes; `blood`."""
     smoke: float = 0.0
     """Light that smoke takes, 0..0.95. The share that is lost in the densest puff within 80 mm; `truth/` shows none."""
-    mechanics: Mechanics = "none"
+    mechanics: Literal["none", "pull", "poke", "breathe"] = "none"
     """Motion of an elastic sheet; true stretch. `truth/mechanics.npz` holds it. The sheet is pulled, poked, or spread
     by breathing, in place of the usual motion."""
-    gain: Gain = "fixed"
+    gain: Literal["fixed", "auto"] = "fixed"
     """`auto`: exposure follows brightness with a lag; truth/tissue keeps the first one."""
     camera: Literal["still", "inspect"] = "still"
     """`inspect`: the camera moves; every 300 frames or so it pans, turns, rolls, retreats, approaches and returns."""
-    border: Border = "none"
+    border: Literal["none", "octagon", "oval", "rounded"] = "none"
     """Black border around the image; `truth/border.npy` says where."""
     overlay: bool = False
     """Draw the moving red box of a detection with text into most frames; `truth/overlay/` says where."""
@@ -120,9 +117,8 @@ class PhantomConfig:
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
-        choices = {"instruments": Instruments, "tissue": Tissue, "border": Border, "gain": Gain, "mechanics": Mechanics}
-        for name, known in ((name, get_args(kinds)) for name, kinds in choices.items()):
-            if getattr(self, name) not in known:
+        for name, hint in get_type_hints(PhantomConfig).items():
+            if get_origin(hint) is Literal and getattr(self, name) not in (known := get_args(hint)):
                 typed = str(getattr(self, name))
                 fix = or_did_you_mean("Choose one of these.", typed, known)
                 raise input_error(name, f"one of {', '.join(known)}", repr(typed), fix)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.geometry import strain_between
 from ..data.sequence import is_test_frame
 from ..data.writer import FrameFiles, SequenceMeta, new_sequence
-from .camera import STILL, Eye
+from .camera import AT_ORIGIN, CameraPose
 from .config import PhantomConfig
 from .events import is_mirrored, parse_events, shows_body
 from .recording import Exposure, RecordedFrame, RenderedFrame, record, render_frame, rows_after_cuts, with_events
@@ -23,7 +23,7 @@ from .sheet import tangents
 from .sinus import build_sinus
 from .texture import smooth_patches
 from .tube import build_tube, write_tube
-from .views import pixel_hits, render_tissue, shown_elsewhere, side_eyes, side_view, visible_points
+from .views import pixel_hits, render_tissue, shown_elsewhere, side_cameras, side_view, visible_points
 
 Mask = NDArray[np.bool_]
 RED = (250, 10, 20)
@@ -94,7 +94,7 @@ def choose_tracks(scene: PhantomScene) -> NDArray[np.int64]:
     weight = pull**2
     weight[even] = 0
     extra = min(cfg.tracks - spread, int((weight > 0).sum()))
-    near_pulls = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum())
+    near_pulls = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum()) if extra else even[:0]
     chosen = np.sort(np.concatenate([even, near_pulls]))
     return np.stack([rows[chosen], columns[chosen]], -1)
 
@@ -123,8 +123,8 @@ def write_phantom(
       `cfg.tissue`;
     - `truth/depth/*.npy`, (H, W) float32 z of the tool-free tissue, mm;
     - `truth/seen/*.npy`, (H, W) bool in test frames: behind a tool, and some training frame shows that tissue;
-    - `truth/tracks.npz`: `points` (T, P, 3) float32 mm in the axes of the frame's camera, `visible` (T, P) bool; with
-      `cfg.has_regions` also `region` (P,);
+    - `truth/tracks.npz`: `points` (T, P, 3) float32 mm in the axes of the frame's camera, `visible` (T, P) bool, False
+      behind tools, border and overlay; with `cfg.has_regions` also `region` (P,);
     - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
       0 where the endoscope does not see the tissue; `truth/side/world_to_camera.json` has their poses (4, 4);
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
@@ -169,21 +169,22 @@ def _write_cavity(writer: FrameFiles, scene: PhantomScene, outside: Mask, progre
     behind_tools, sides = _BehindTools(scene), {}
     exposure, gains = None, []
     for index in range(cfg.frames):
-        frame = render_frame(scene, index)
+        frame, drawn, rows = render_frame(scene, index), overlay(cfg, index), rows_after_cuts(events, index)
         if exposure is None:
             exposure = Exposure.of_first(scene, frame)
-            sides = side_eyes(float(np.median(frame.z))) if cfg.side_views else {}
+            sides = side_cameras(float(np.median(frame.z))) if cfg.side_views else {}
         gains.append(exposure.now / exposure.first)
-        seen = visible_points(frame.now.vertices, frame.z, frame.tool_mask, cfg)
-        behind_tools.add(frame, seen)
+        in_body = shows_body(events, index)
+        hidden = frame.tool_mask | (outside | drawn)[rows]
+        seen = visible_points(frame.now.vertices, frame.z, hidden, cfg) & in_body
+        behind_tools.add(index, frame.tool_mask & in_body, seen, rows)
         points.append(frame.now.vertices[tracked[:, 0], tracked[:, 1]])
-        is_clear = shows_body(events, index) and not is_mirrored(events, index)
-        visible.append(seen[tracked[:, 0], tracked[:, 1]] & is_clear)
-        _write_truth(writer, scene, frame, exposure.first, lens, rows_after_cuts(events, index))
+        visible.append(seen[tracked[:, 0], tracked[:, 1]] & (not is_mirrored(events, index)))
+        _write_truth(writer, scene, frame, exposure.first, lens, rows)
         if is_test_frame(index):
             _write_sides(writer, scene, frame, exposure.first, sides)
         recorded = with_events(record(scene, frame, exposure.now, lens), events, index, cfg.seed)
-        _write_recorded(writer, recorded, outside, overlay(cfg, index))
+        _write_recorded(writer, recorded, outside, drawn)
         if cfg.gain == "auto":
             exposure = exposure.after(frame)
         progress(index + 1, cfg.frames)
@@ -198,22 +199,26 @@ class _BehindTools:
     def __init__(self, scene: PhantomScene) -> None:
         self._scene = scene
         self._trained_on = np.zeros(scene.a.shape, bool)  # (MH, MW) vertices that some training frame shows
-        self._tools: dict[int, NDArray[np.uint8]] = {}  # packed mask of each test frame
+        self._tools: dict[int, tuple[NDArray[np.uint8], slice]] = {}  # packed mask and rows of each test frame
 
-    def add(self, frame: RenderedFrame, seen: Mask) -> None:
-        """Note a frame, in which the vertices `seen` (MH, MW) are visible."""
-        if is_test_frame(frame.index):
-            self._tools[frame.index] = np.packbits(frame.tool_mask)
+    def add(self, index: int, tool: Mask, seen: Mask, rows: slice) -> None:
+        """Note a frame with the mask `tool` (H, W), in which the vertices `seen` (MH, MW) are visible.
+
+        Args:
+            rows: in which order it is written.
+        """
+        if is_test_frame(index):
+            self._tools[index] = np.packbits(tool), rows
         else:
             self._trained_on |= seen
 
     def write(self, writer: FrameFiles) -> None:
         """Write `truth/seen`."""
         cfg = self._scene.cfg
-        for index, packed in self._tools.items():
+        for index, (packed, rows) in self._tools.items():
             hits = pixel_hits(self._scene.seen_vertices(index / (cfg.frames - 1)), cfg)
             tool = np.unpackbits(packed, count=hits[..., 0].size).reshape(hits.shape[:2]) > 0
-            writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, self._trained_on, tool))
+            writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, self._trained_on, tool)[rows])
 
 
 def _write_recorded(writer: FrameFiles, recorded: RecordedFrame, outside: Mask, drawn: Mask) -> None:
@@ -237,17 +242,17 @@ def _write_truth(
     write_tissue("truth/tissue", frame.view.tissue)
     writer.write_array(f"truth/depth/{index:06d}.npy", frame.z[rows])
     if is_test_frame(index) and (scene.smoke is None or cfg.smoke):
-        write_tissue("truth/no_highlights", render_tissue(scene, frame.now, STILL, highlights=False)[0])
+        write_tissue("truth/no_highlights", render_tissue(scene, frame.now, AT_ORIGIN, highlights=False)[0])
     if cfg.overlay:
         writer.write_array(f"truth/overlay/{index:06d}.npy", overlay(cfg, index))
 
 
 def _write_sides(
-    writer: FrameFiles, scene: PhantomScene, frame: RenderedFrame, gain: float, sides: dict[str, Eye]
+    writer: FrameFiles, scene: PhantomScene, frame: RenderedFrame, gain: float, sides: dict[str, CameraPose]
 ) -> None:
     """What the side cameras see of a frame: image and depth."""
-    for name, eye in sides.items():
-        image, depth = side_view(scene, frame.now, eye, frame.z, frame.tool_mask, gain)
+    for name, pose in sides.items():
+        image, depth = side_view(scene, frame.now, pose, frame.z, frame.tool_mask, gain)
         writer.write_image(f"truth/side/{name}", image, frame.index)
         writer.write_array(f"truth/side/{name}/{frame.index:06d}.npy", depth)
 
@@ -277,14 +282,16 @@ def _deformed(scene: PhantomScene, tracked: NDArray[np.int64]) -> dict[str, NDAr
     return {name: np.stack(values).astype(np.float32) for name, values in found.items()}
 
 
-def _write_descriptions(writer: FrameFiles, scene: PhantomScene, sides: dict[str, Eye], gains: list[float]) -> None:
+def _write_descriptions(
+    writer: FrameFiles, scene: PhantomScene, sides: dict[str, CameraPose], gains: list[float]
+) -> None:
     """Poses of the cameras, the calibration of the pair, and kinds of tools and tissue, where they are not obvious."""
     cfg = scene.cfg
     if scene.path.excursions:
         writer.camera_to_world = scene.path.poses(cfg.frames)
         writer.write_array("truth/camera_to_world.npy", writer.camera_to_world)
     if sides:
-        poses = {name: eye.world_to_camera.tolist() for name, eye in sides.items()}
+        poses = {name: pose.world_to_camera.tolist() for name, pose in sides.items()}
         writer.write_json("truth/side/world_to_camera.json", poses)
     if cfg.stereo:
         (cx, cy), focal = cfg.center, cfg.focal

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..compute.parallel_kernels import parallel_njit
 from ..compute.simd import REORDERED
-from .camera import STILL, Eye
+from .camera import AT_ORIGIN, CameraPose
 from .graspers import draw_graspers
 from .instrument_light import Material, paint_at, radiance_at
 from .instrument_shapes import Part, distance
@@ -206,7 +206,7 @@ def render_instruments(
     camera: NDArray[np.floating],
     focal: float,
     center: tuple[float, float],
-    endoscope: Eye = STILL,
+    endoscope: CameraPose = AT_ORIGIN,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Render instruments in front of the tissue.
 
@@ -226,8 +226,8 @@ def render_instruments(
         materials += [material.row() for material in tool.materials]
     packed = np.stack(tools)
     # A point and six directions, chosen in the world: a tool that is static stays so when the camera moves.
-    packed[:, :3] = endoscope.sees(packed[:, :3])
-    packed[:, 3:21] = (packed[:, 3:21].reshape(-1, 6, 3) @ endoscope.turn).reshape(-1, 18)
+    packed[:, :3] = endoscope.to_camera(packed[:, :3])
+    packed[:, 3:21] = (packed[:, 3:21].reshape(-1, 6, 3) @ endoscope.rotation).reshape(-1, 18)
     color = np.zeros((*tissue_z.shape, 3), np.float32)
     depth = np.full(tissue_z.shape, FAR, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))

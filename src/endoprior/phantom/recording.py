@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import STILL, Eye
+from .camera import AT_ORIGIN, CameraPose
 from .events import Event, disturbed, is_mirrored, shows_body
-from .scene import Moment, PhantomScene
+from .scene import PhantomScene, SceneState
 from .sensor import develop, expose, exposure_gain, metered, next_gain, stereo_depth
 from .views import RenderedView, pixel_hits, render_view
 
@@ -23,7 +23,7 @@ class RenderedFrame:
     """One frame before the camera exposes it."""
 
     index: int
-    now: Moment
+    now: SceneState
     view: RenderedView
     z: NDArray[np.float32]
     """(H, W) z of the tissue, behind tools too, mm."""
@@ -33,8 +33,8 @@ class RenderedFrame:
 
 def render_frame(scene: PhantomScene, index: int) -> RenderedFrame:
     """Render frame `index` of the endoscope's left camera."""
-    now = Moment.of(scene, index / (scene.cfg.frames - 1))
-    view = render_view(scene, now, STILL)
+    now = SceneState.of(scene, index / (scene.cfg.frames - 1))
+    view = render_view(scene, now, AT_ORIGIN)
     tool_mask = cv2.dilate((view.tool_share > 0).astype(np.uint8), RIM) > 0
     return RenderedFrame(index, now, view, pixel_hits(now.vertices, scene.cfg)[..., 2], tool_mask)
 
@@ -87,7 +87,7 @@ def _right_image(
     scene: PhantomScene, frame: RenderedFrame, gain: float, lens: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
     cfg = scene.cfg
-    view = render_view(scene, frame.now, Eye.moved(cfg.baseline_mm))
+    view = render_view(scene, frame.now, CameraPose.moved_right(cfg.baseline_mm))
     return expose(develop(view.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, frame.index]))
 
 

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import STILL, Eye
+from .camera import AT_ORIGIN, CameraPose
 from .config import PhantomConfig
-from .scene import Moment, build_scene
+from .scene import SceneState, build_scene
 from .sensor import develop, expose, exposure_gain, vignette
 from .views import render_view
 
@@ -124,12 +124,12 @@ def sample_frames(cfg: SampleConfig) -> Iterator[NDArray[np.uint8]]:
     places = [(phantom.focal * seen + phantom.center - 0.5).astype(np.float32) for seen in rays]
     maps = [(np.ascontiguousarray(each[..., 0]), np.ascontiguousarray(each[..., 1])) for each in places]
     light = [vignette(cfg.width, cfg.height) * _stop(cfg, right)[..., None] for right in (0, 1)]
-    eyes = STILL, Eye(np.array(_BASELINE_MM), np.eye(3))
+    poses = AT_ORIGIN, CameraPose(np.array(_BASELINE_MM), np.eye(3))
     scene, gain = build_scene(phantom), 0.0
     for index in range(cfg.frames):
-        now, images = Moment.of(scene, index / (cfg.frames - 1)), []
-        for right, eye in enumerate(eyes):
-            view = render_view(scene, now, eye)
+        now, images = SceneState.of(scene, index / (cfg.frames - 1)), []
+        for right, pose in enumerate(poses):
+            view = render_view(scene, now, pose)
             gain = gain or exposure_gain(view.tissue) * scene.look.exposure
             bent = cv2.remap(view.image, *maps[right], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             rng = np.random.default_rng([cfg.seed, 9 + right, index])

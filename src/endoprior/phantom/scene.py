@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import CameraPath, Eye, build_camera_path, widened
+from .camera import CameraPath, CameraPose, build_camera_path, widened
 from .config import PhantomConfig
 from .instrument_families import instruments_of
 from .instrument_tracing import Instrument
@@ -56,13 +56,13 @@ class Smoke:
         return float(self.peaks[k] * smooth_step(0.06, 0.35, local) * (1 - smooth_step(0.55, 0.97, local)))
 
     def veiled(
-        self, radiance: NDArray, z: NDArray, phase: float, eye: Eye, focal: float, center: tuple[float, float]
+        self, radiance: NDArray, z: NDArray, phase: float, pose: CameraPose, focal: float, center: tuple[float, float]
     ) -> NDArray:
         """(SH, SW, 3) float32 linear radiance behind smoke, mixed with the light that the smoke scatters back.
 
         Args:
             radiance: (SH, SW, 3) without smoke. z: (SH, SW) depth of what is seen, mm.
-            eye: the camera, in the axes of the endoscope's left one, with which the smoke moves.
+            pose: the camera, in the axes of the endoscope's left one, with which the smoke moves.
             focal, center: of the sample grid, px.
         """
         density = self.density(phase)
@@ -71,7 +71,7 @@ class Smoke:
         height, width = z.shape
         y, x = np.mgrid[:height:_COARSE, :width:_COARSE].astype(np.float32)
         x, y = (x - center[0]) / focal, (y - center[1]) / focal
-        clouds = self._clouds(x * _VEIL_MM + eye.center[0], y * _VEIL_MM + eye.center[1], phase) * density
+        clouds = self._clouds(x * _VEIL_MM + pose.center[0], y * _VEIL_MM + pose.center[1], phase) * density
         # The light guides shine less away from the optical axis.
         axis = (1 / (1 + np.hypot(x, y) ** 2) ** 2).astype(np.float32)
         columns, rows = np.meshgrid(*(np.arange(size, dtype=np.float32) / _COARSE for size in (width, height)))
@@ -121,21 +121,20 @@ class PhantomScene:
         moved = self.motion.displacement(self.a, self.b, phase)
         return self.plane.lift(self.a + moved[..., 0], self.b + moved[..., 1], self.height + moved[..., 2])
 
-    def endoscope(self, phase: float) -> Eye:
+    def endoscope(self, phase: float) -> CameraPose:
         """Its left camera in the world at time `phase`."""
-        pose = self.path.camera_to_world(phase)
-        return Eye(pose[:3, 3], pose[:3, :3])
+        return CameraPose.of(self.path.camera_to_world(phase))
 
     def seen_vertices(self, phase: float) -> NDArray[np.float64]:
         """(MH, MW, 3) mesh in the axes of the endoscope's left camera at time `phase`, mm."""
-        return self.endoscope(phase).sees(self.vertices(phase))
+        return self.endoscope(phase).to_camera(self.vertices(phase))
 
 
 @dataclass(frozen=True)
-class Moment:
-    """What moves, at one time, in the axes of the endoscope's left camera of that time."""
+class SceneState:
+    """The scene at one time: what moves, in the axes of the endoscope's left camera of that time."""
 
-    endoscope: Eye
+    endoscope: CameraPose
     vertices: NDArray[np.float64]
     normals: NDArray[np.float32]
     """(MH, MW, 3) mesh, mm, and its unit normals."""
@@ -144,10 +143,10 @@ class Moment:
     phase: float = 0.0
 
     @staticmethod
-    def of(scene: PhantomScene, phase: float) -> Moment:
+    def of(scene: PhantomScene, phase: float) -> SceneState:
         """The scene at time `phase` in [0, 1]."""
         vertices = scene.seen_vertices(phase)
-        return Moment(scene.endoscope(phase), vertices, vertex_normals(vertices), scene.motion.tools(phase), phase)
+        return SceneState(scene.endoscope(phase), vertices, vertex_normals(vertices), scene.motion.tools(phase), phase)
 
 
 def build_scene(cfg: PhantomConfig) -> PhantomScene:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..compute.parallel_kernels import parallel_njit
 from ..compute.simd import REORDERED
-from .camera import Eye
+from .camera import CameraPose
 from .raster import FAR
 
 LIGHTS_MM = np.array([[-3.6, -2.2, 0.0], [3.9, -1.8, 0.0]], np.float32)
@@ -114,7 +114,7 @@ def shade(
     normals: NDArray[np.float32],
     texture: NDArray[np.float32],
     axes: NDArray[np.float64],
-    eye: Eye,
+    pose: CameraPose,
     viewer: NDArray[np.float64],
     focal: float,
     center: tuple[float, float],
@@ -124,18 +124,18 @@ def shade(
     """(SH, SW, 3) linear radiance of the tissue at every sample of `hits`.
 
     Args:
-        hits: (SH, SW, 3) from `raster.rasterize`, as `eye` sees them.
+        hits: (SH, SW, 3) from `raster.rasterize`, as `pose` sees them.
         normals: (MH, MW, 3) unit vertex normals.
         texture: (TH, TW, 7) material maps.
         axes: (2, 3) e_a and e_b of the tissue's plane in the axes of the left camera.
-        eye: the camera; the lights stay with the left one. viewer: (3,) mm, where the light goes to.
+        pose: the camera; the lights stay with the left one. viewer: (3,) mm, where the light goes to.
         focal, center: of the sample grid, px.
         highlights: False leaves those of the wet film out; the broad sheen stays.
     """
     out = np.empty_like(hits)
     e_a, e_b = np.ascontiguousarray(axes, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
-    center_mm, turn = eye.center.astype(np.float32), np.ascontiguousarray(eye.turn, np.float32)
+    center_mm, turn = pose.center.astype(np.float32), np.ascontiguousarray(pose.rotation, np.float32)
     seen_from, wet = viewer.astype(np.float32), np.float32(highlights)
     _shade(hits, normals, texture, e_a, e_b, center_mm, turn, seen_from, LIGHTS_MM, f, cx, cy, FAR, wet, out)
     return out

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.writer import FrameFiles
-from .camera import STILL, Eye
+from .camera import AT_ORIGIN, CameraPose
 from .config import PhantomConfig
 from .noise import fractal
 from .raster import FAR, vertex_normals
@@ -151,7 +151,7 @@ def write_tube(
     lens, gain = vignette(cfg.width, cfg.height), 0.0
     points, visible, tracked = [], [], _tracks(tube, cfg)
     for index, pose in enumerate(tube.poses):
-        seen = Eye(pose[:3, 3], pose[:3, :3]).sees(tube.vertices)
+        seen = CameraPose.of(pose).to_camera(tube.vertices)
         radiance, z = _rendered(seen, tube.texture, cfg)
         gain = gain or exposure_gain(radiance)
         rng = np.random.default_rng([cfg.seed, 6, index])
@@ -174,7 +174,7 @@ def _rendered(seen: NDArray, texture: NDArray, cfg: PhantomConfig) -> tuple[NDAr
     hits, focal, middle = sample_hits(seen, cfg)
     normals = vertex_normals(seen)
     assert hits[..., 2].max() < FAR, "the tube ends inside the image"
-    radiance = shade(hits, normals, texture, np.eye(3)[:2], STILL, STILL.center, focal, middle)
+    radiance = shade(hits, normals, texture, np.eye(3)[:2], AT_ORIGIN, AT_ORIGIN.center, focal, middle)
     return pooled(radiance, cfg), pixel_hits(seen, cfg)[..., 2]
 
 
@@ -182,7 +182,7 @@ def _tracks(tube: Tube, cfg: PhantomConfig) -> NDArray[np.int64]:
     """(P, 2) mesh rows and columns of what the first, the middle or the last frame shows, evenly spread."""
     seen, no_tool = np.zeros(tube.vertices.shape[:2], bool), np.zeros((cfg.height, cfg.width), bool)
     for pose in tube.poses[[0, len(tube.poses) // 2, -1]]:
-        vertices = Eye(pose[:3, 3], pose[:3, :3]).sees(tube.vertices)
+        vertices = CameraPose.of(pose).to_camera(tube.vertices)
         seen |= visible_points(vertices, pixel_hits(vertices, cfg)[..., 2], no_tool, cfg)
     places = np.argwhere(seen)
     return places[np.unique(np.linspace(0, len(places) - 1, cfg.tracks).astype(int))]

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import STILL, Eye
+from .camera import AT_ORIGIN, CameraPose
 from .config import PhantomConfig
 from .instrument_tracing import render_instruments
 from .raster import FAR, rasterize
-from .scene import Moment, PhantomScene
+from .scene import PhantomScene, SceneState
 from .sensor import develop, vignette_at
 from .shading import shade
 
@@ -42,46 +42,46 @@ class RenderedView:
     """(H, W) z of the nearest tool sample, mm; FAR where there is none."""
 
 
-def render_view(scene: PhantomScene, now: Moment, eye: Eye) -> RenderedView:
+def render_view(scene: PhantomScene, now: SceneState, pose: CameraPose) -> RenderedView:
     """Render the tissue and the tools of one moment from one camera."""
     n = SUPERSAMPLE
-    tissue, z = _tissue_samples(scene, now, eye, eye.center)
+    tissue, z = _tissue_samples(scene, now, pose, pose.center)
     assert z.max() < FAR, "the material ends inside the image"
     focal, center = _sample_grid(scene.cfg)
     tools = now.tools, scene.instruments, scene.cfg.seed
-    color, depth = render_instruments(*tools, tissue, z, eye.center, focal, center, now.endoscope)
+    color, depth = render_instruments(*tools, tissue, z, pose.center, focal, center, now.endoscope)
     is_tool = depth < FAR
     light = np.array(scene.look.light, np.float32)
     image = np.where(is_tool[..., None], color, tissue) * light
     tissue = tissue * light
     if scene.smoke is not None:
         if not scene.cfg.smoke:  # smoke as a kind of tissue belongs to the truth
-            tissue = scene.smoke.veiled(tissue, z, now.phase, eye, focal, center)
-        image = scene.smoke.veiled(image, np.minimum(z, depth), now.phase, eye, focal, center)
+            tissue = scene.smoke.veiled(tissue, z, now.phase, pose, focal, center)
+        image = scene.smoke.veiled(image, np.minimum(z, depth), now.phase, pose, focal, center)
     nearest = np.minimum.reduce([depth[i::n, j::n] for i in range(n) for j in range(n)])
     share = pooled(is_tool.astype(np.float32), scene.cfg)
     return RenderedView(pooled(tissue, scene.cfg), pooled(image, scene.cfg), share, nearest)
 
 
 def render_tissue(
-    scene: PhantomScene, now: Moment, eye: Eye, *, highlights: bool = True
+    scene: PhantomScene, now: SceneState, pose: CameraPose, *, highlights: bool = True
 ) -> tuple[NDArray, NDArray[np.float32]]:
     """(H, W, 3) radiance towards the endoscope of the tissue that a camera sees, and (H, W) its z, mm, or `FAR`.
 
     Smoke is left out: it is not on the tissue.
     """
-    samples, _ = _tissue_samples(scene, now, eye, STILL.center, highlights)
+    samples, _ = _tissue_samples(scene, now, pose, AT_ORIGIN.center, highlights)
     radiance = pooled(samples * np.array(scene.look.light, np.float32), scene.cfg)
-    return radiance, pixel_hits(eye.sees(now.vertices), scene.cfg)[..., 2]
+    return radiance, pixel_hits(pose.to_camera(now.vertices), scene.cfg)[..., 2]
 
 
 def _tissue_samples(
-    scene: PhantomScene, now: Moment, eye: Eye, viewer: NDArray[np.float64], highlights: bool = True
+    scene: PhantomScene, now: SceneState, pose: CameraPose, viewer: NDArray[np.float64], highlights: bool = True
 ) -> tuple[NDArray, NDArray]:
     """(SH, SW, 3) radiance towards `viewer` (3,) and (SH, SW) z of every sample."""
-    hits, focal, center = sample_hits(eye.sees(now.vertices), scene.cfg)
-    axes = scene.plane.axes[:2] @ now.endoscope.turn
-    radiance = shade(hits, now.normals, scene.texture, axes, eye, viewer, focal, center, highlights=highlights)
+    hits, focal, center = sample_hits(pose.to_camera(now.vertices), scene.cfg)
+    axes = scene.plane.axes[:2] @ now.endoscope.rotation
+    radiance = shade(hits, now.normals, scene.texture, axes, pose, viewer, focal, center, highlights=highlights)
     return radiance, np.ascontiguousarray(hits[..., 2])
 
 
@@ -131,20 +131,20 @@ def shown_elsewhere(hits: NDArray[np.float32], seen: NDArray[np.bool_], tool: ND
     return tool & seen[row, column]
 
 
-def side_eyes(pivot_mm: float) -> dict[str, Eye]:
+def side_cameras(pivot_mm: float) -> dict[str, CameraPose]:
     """The side cameras by name; they turn about an axis `pivot_mm` from the endoscope, on its optical axis."""
     pivot = np.array([0.0, 0.0, pivot_mm])
-    eyes = {}
+    poses = {}
     for name, degrees in TURNS_DEG.items():
         # A camera to the right looks back to the left: its z axis turns towards -x.
         angle = -np.deg2rad(degrees)
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        eyes[name] = Eye(pivot - turn @ pivot, turn)
-    return eyes | {name: Eye.moved(mm) for name, mm in ASIDE_MM.items()}
+        poses[name] = CameraPose(pivot - turn @ pivot, turn)
+    return poses | {name: CameraPose.moved_right(mm) for name, mm in ASIDE_MM.items()}
 
 
 def side_view(
-    scene: PhantomScene, now: Moment, eye: Eye, front_z: NDArray, tool: NDArray[np.bool_], gain: float
+    scene: PhantomScene, now: SceneState, pose: CameraPose, front_z: NDArray, tool: NDArray[np.bool_], gain: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """(H, W, 3) noise-free image of one side camera and (H, W) its depth, mm; 0 where the endoscope sees no tissue.
 
@@ -153,10 +153,10 @@ def side_view(
         gain: exposure.
     """
     cfg = scene.cfg
-    radiance, z = render_tissue(scene, now, eye)
+    radiance, z = render_tissue(scene, now, pose)
     y, x = np.mgrid[: cfg.height, : cfg.width].astype(np.float64) + 0.5
     rays = np.stack([(x - cfg.center[0]) / cfg.focal, (y - cfg.center[1]) / cfg.focal, np.ones_like(x)], -1)
-    points = (rays * np.where(z < FAR, z, 1)[..., None]) @ eye.turn.T + eye.center
+    points = (rays * np.where(z < FAR, z, 1)[..., None]) @ pose.rotation.T + pose.center
     seen = (z < FAR) & (points[..., 2] > 0)
     points[~seen] = (0, 0, 1)
     seen &= visible_points(points, front_z, tool, cfg)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from ..visualization.figures import save_figure
+from ..visualization.image_tools import save_figure
 from .scan import PICTURES
 from .segments import WORDS, best_segment, from_json, segments_of
 from .source import open_source

@@ -17,8 +17,7 @@ from ..evaluation.context import read_frame_scores, read_scores
 from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
-from ..visualization.figures import save_figure
-from ..visualization.image_tools import colorize, to_u8
+from ..visualization.image_tools import colorize, save_figure, to_u8
 from ..visualization.rendered_views import depth_span, tissue_distance, turned
 from ..visualization.tissue_layers import PaintedTissue, SupportMap
 from .folder import LOG

@@ -1,9 +1,10 @@
-"""Helpers for images: color maps, labels, tiling, sheets of frames with their masks, PNG files."""
+"""Helpers for images and figures: color maps, labels, tiling, sheets of frames with their masks, PNG files."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 
 from ..data.images import save_png
 from ..system.atomic import whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SOLID_ALPHA = 0.5
 """There is no surface where alpha is lower."""
@@ -22,6 +26,18 @@ def write_png(path: Path, rgb_u8: NDArray[np.uint8]) -> None:
     """Write an (H, W, 3) RGB or (H, W) gray 8-bit image, atomically."""
     with whole_file(path) as temporary:
         save_png(temporary, rgb_u8)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure with a layout engine as a PNG file, completely or not at all.
+
+    Matplotlib draws such a figure twice to save it, first only for its layout, which needs no drawing.
+    """
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+        figure.set_layout_engine("none")
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": 1})
 
 
 def to_u8(unit: NDArray) -> NDArray[np.uint8]:

@@ -134,10 +134,10 @@ def write_views(
                     np.save(temporary, depth)
                 yield [label(color, "EndoPrior-GS"), label(colorize(depth, *span, depth > 0), "depth")]
 
-    write_film(pictures(), out / "side_by_side", video, scene.frames_per_second, frames)
+    write_side_by_side(pictures(), out / "side_by_side", video, scene.frames_per_second, frames)
 
 
-def write_film(
+def write_side_by_side(
     pictures: Iterable[list[NDArray[np.uint8]]],
     out: Path,
     video: Path,

@@ -23,7 +23,7 @@ from ..model.scene import Scene
 from ..model.surface import FramesOf, Support, project_visible, render_surface
 from ..system.atomic import whole_file
 from .image_tools import SOLID_ALPHA, label, to_u8
-from .rendered_views import TimedCamera, file_stem, write_film
+from .rendered_views import TimedCamera, file_stem, write_side_by_side
 
 SQUARES, STRIPES = 40, 80
 """Squares of the grid and stripes of the hatching along the width of the image: 16 px and 8 px of 640."""
@@ -144,16 +144,16 @@ def _marked(
     return ((1 - dots) * color + dots * DOTS).astype(np.float32)
 
 
-def write_texture_film(
+def write_texture_video(
     scene: Scene, views: list[TimedCamera], out: Path, video: Path, frames: Sequence[Frame] | None = None
 ) -> None:
-    """Write a grid, painted on the first frame, as it is carried to each view; see `write_film`."""
+    """Write a grid, painted on the first frame, as it is carried to each view; see `write_side_by_side`."""
     painted = PaintedTissue(scene)
     pictures = ([label(to_u8(painted.render(*view)), "carried grid")] for view in views)
-    write_film(pictures, out, video, scene.frames_per_second, frames)
+    write_side_by_side(pictures, out, video, scene.frames_per_second, frames)
 
 
-def write_support_film(
+def write_support_video(
     support: SupportMap,
     views: list[TimedCamera],
     out: Path,
@@ -161,7 +161,7 @@ def write_support_film(
     frames_per_second: float,
     frames: Sequence[Frame] | None = None,
 ) -> None:
-    """Write each view, and what stands behind it as `out/*.npy`; see `write_film`.
+    """Write each view, and what stands behind it as `out/*.npy`; see `write_side_by_side`.
 
     The NPY is (H, W, 2) float32: `SupportPicture.num_frames` and `gap_seconds`.
     """
@@ -173,4 +173,4 @@ def write_support_film(
                 np.save(temporary, np.stack([shown.num_frames, shown.gap_seconds], -1))
             yield [label(to_u8(shown.color), shown.legend)]
 
-    write_film(pictures(), out, video, frames_per_second, frames)
+    write_side_by_side(pictures(), out, video, frames_per_second, frames)

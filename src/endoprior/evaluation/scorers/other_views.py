@@ -1,7 +1,7 @@
 """What no training frame shows at that time: tissue behind the tool, from cameras beside, and from the right eye.
 
 Behind the tool and from the sides the truth is that of a phantom; from cameras beside the endoscope only tissue that
-it sees in the same frame counts (`phantom/side_views.py`). The right eye of a stereo endoscope has pictures of its own,
+it sees in the same frame counts (`phantom/views.py`). The right eye of a stereo endoscope has pictures of its own,
 which no method trains on; there only tissue that both eyes see counts, by measured depth (`footage/stereo_order.py`),
 and the left picture, moved to the right eye by that depth, is scored beside the scene.
 """

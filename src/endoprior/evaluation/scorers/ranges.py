@@ -45,10 +45,10 @@ SCORES = SEEN + HIDDEN
 
 def compute(context: EvaluationContext) -> None:
     """Count true positions inside of the ranges; nothing without ground truth."""
-    sequence, scene = context.sequence, context.scene
+    sequence = context.sequence
     if sequence.truth is None:
         return
-    true = true_tracks(sequence)
+    scene, true = context.scene, true_tracks(sequence)
     if true is None:
         for score in SCORES:
             context.skip(score.name, NO_TRACKS)

@@ -33,6 +33,9 @@ class Released(GaussianMethod):
     growth_ends, last_reset = 0.0, 0.0
     """Shares of the published fine stage after which growth ends and opacities are lowered last; 0: not before its end,
     never. `fit_to_clip` takes them of the stage that is trained, and lowers opacities once."""
+    first_reset, reset_every = 0, 0
+    """Iterations after which the release lowers opacities while Gaussians grow: the first one, which belongs to a white
+    background, and every n-th; 0: never."""
 
     def config(self) -> Config:
         """What its preset starts from."""
@@ -55,11 +58,8 @@ class Released(GaussianMethod):
     def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
         if cfg.fit_to_clip:
             return stage is Stage.FINE and iteration == round(self.last_reset * cfg.schedule.fine_iterations)
-        return self.released_reset_due(iteration, cfg)
-
-    def released_reset_due(self, _iteration: int, _cfg: Config) -> bool:
-        """See `reset_due`, with the numbers of the release."""
-        return False
+        inside = self.reset_every and iteration < cfg.density.stop_iteration
+        return bool(inside and (iteration == self.first_reset or iteration % self.reset_every == 0))
 
 
 def grid_points(frames: Sequence[Frame], every_px: int, first_px: int) -> PointCloud:
