@@ -221,6 +221,16 @@ def test_what_cannot_be_used_is_one_line_and_changes_nothing(folder, capsys, nam
     assert contents(folder) == before
 
 
+@pytest.mark.parametrize("arrays", [{"visible": np.ones(2)}, {"points": np.array(["a"])}, None])
+def test_damaged_points_are_one_line_and_change_nothing(folder, arrays):
+    file = folder / "truth" / "tracks.npz"
+    file.write_bytes(b"damaged") if arrays is None else np.savez(file, **arrays)
+    before = contents(folder)
+    with pytest.raises(InputError, match=r"tracks\.npz: expected"):
+        write_scale(folder, Scale(2.5, 0.07, "known length in frame 1"))
+    assert contents(folder) == before
+
+
 def test_folders_that_are_in_mm_or_without_tools(folder, capsys):
     for file in (folder / "masks").iterdir():
         save_png(file, np.zeros((HEIGHT, WIDTH), np.uint8))

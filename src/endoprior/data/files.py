@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from string import ascii_lowercase, ascii_uppercase
 from typing import Any, get_origin
 
@@ -209,6 +209,14 @@ def named_file(folder: Path, name: str) -> Path:
     """The file below a folder that another file names. Elsewhere than on Windows, a name may hold a backslash."""
     literal = folder / name
     return literal if "\\" not in name or literal.exists() else folder / portable(name)
+
+
+def file_below(folder: Path, name: str, source: Path) -> Path:
+    """As `named_file`; InputError about `source`, which names the file, for an absolute path to another folder."""
+    found = named_file(folder, name)
+    if PureWindowsPath(name).drive or not found.is_relative_to(folder):
+        raise input_error(source, "paths from its folder", name[:80], "write paths relative to the file.")
+    return found
 
 
 def read_json(
