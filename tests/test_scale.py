@@ -20,8 +20,9 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence, scale_files
 from endoprior.data.images import save_png
-from endoprior.data.known_length import (
+from endoprior.data.scale import (
     SHAPE_STD,
+    Scale,
     length_std,
     parse_known_length,
     relative_length,
@@ -29,7 +30,6 @@ from endoprior.data.known_length import (
     scale_between,
     scale_by_lengths,
 )
-from endoprior.data.scale import Scale
 from endoprior.data.scale_files import finish_scale, write_scale
 from endoprior.data.writer import FrameFiles, SequenceMeta, new_sequence
 from endoprior.prepare import prepare

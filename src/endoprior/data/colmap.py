@@ -20,6 +20,7 @@ from .files import IMAGE_SUFFIXES, entries, file_below
 from .formats import DatasetFormat
 from .lens import MODELS, Lens
 from .posed_images import PosedImage, load_posed
+from .poses import POSES
 from .reading import read_bytes, read_text
 from .sequence import FrameSequence
 
@@ -166,7 +167,7 @@ def model_folder(path: Path) -> Path | None:
 
 def is_colmap(path: Path) -> bool:
     """Whether a folder has images and a model, and no poses of its own."""
-    return (path / "images").is_dir() and not (path / "poses_bounds.npy").exists() and model_folder(path) is not None
+    return (path / "images").is_dir() and not (path / POSES).exists() and model_folder(path) is not None
 
 
 def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:

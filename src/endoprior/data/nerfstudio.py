@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from .files import file_below, read_json, read_matrix
+from .files import file_below
 from .formats import DatasetFormat
 from .images import read_color
 from .lens import COEFFICIENTS, Lens
 from .posed_images import PosedImage, load_posed
-from .poses import ROTATION_TOLERANCE, demand_rotations
+from .poses import POSES, ROTATION_TOLERANCE, demand_rotations
+from .reading import read_json, read_matrix
 from .sequence import FrameSequence
 
 FILE = "transforms.json"
@@ -35,7 +36,7 @@ TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL camera axes (x right,
 
 def is_nerfstudio(path: Path) -> bool:
     """Whether a folder has `transforms.json`, and is not complete in the EndoNeRF layout."""
-    complete = all((path / name).exists() for name in ("poses_bounds.npy", "masks", "depth"))
+    complete = all((path / name).exists() for name in (POSES, "masks", "depth"))
     return (path / FILE).is_file() and not complete
 
 

@@ -19,10 +19,10 @@ from ..core.checks import input_error
 from ..core.shell import command
 from ..system.atomic import whole_file, whole_folder, write_json
 from .description import PATH_RECORD, SCALE_PENDING, read_description
-from .files import read_json, read_parts
-from .reading import read_numpy
+from .poses import POSES, scaled_poses
+from .reading import read_json, read_numpy, read_parts
 from .scale import Scale, demand_relative, described_scale
-from .writer import POSES, demand_writable
+from .writer import demand_writable
 
 LENGTHS_OF_PATH = {"translation_std_mm"}  # lists of lengths in `camera_path.json`
 TRACKS = Path("truth", "tracks.npz")  # known points, which `prepare --stir` lifts by the depth
@@ -70,13 +70,6 @@ def finish_scale(folder: Path) -> bool:
     return True
 
 
-def scaled_poses(table: NDArray[np.float64], ratio: float) -> NDArray[np.float64]:
-    """(T, 17) rows of `poses_bounds.npy` with their translations and bounds multiplied."""
-    out = np.array(table, np.float64)
-    out[:, [3, 8, 13, 15, 16]] *= ratio
-    return out
-
-
 def scaled_record(record: dict[str, Any], ratio: float) -> dict[str, Any]:
     """The content of `camera_path.json` with its lengths multiplied."""
 
@@ -108,4 +101,4 @@ def _scale_tracks(file: Path, target: Path, ratio: float) -> None:
         raise input_error(file, "an array points", "none of real numbers", fix)
     arrays["points"] = (points * ratio).astype(points.dtype)
     with whole_file(target) as temporary:
-        np.savez_compressed(temporary, **arrays)
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)

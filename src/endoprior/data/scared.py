@@ -20,10 +20,11 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .files import list_files, read_json, read_matrix
+from .files import list_files
 from .formats import DatasetFormat
 from .images import read_color, read_values
 from .poses import demand_rotations
+from .reading import read_json, read_matrix
 from .sequence import FrameSequence
 
 STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}  # published frame stride of each dataset number

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..core.geometry import FARTHEST_MM, Strain
 from .description import MAX_NUMBER, MIN_NUMBER, is_number
-from .files import IMAGE_SUFFIXES, files_with, read_json
+from .files import IMAGE_SUFFIXES, files_with
 from .frame_files import match_names
 from .images import Size, read_color, read_header
 from .pixels import shrunk_color
 from .poses import ROTATION_TOLERANCE, demand_rotations
-from .reading import read_bytes, read_numpy
+from .reading import read_bytes, read_json, read_numpy
 
 _AGAIN = "write the truth again."
 
