@@ -238,9 +238,11 @@ def test_truth_is_read_when_asked_for(tiny_sequence):
     ("arrays", "words"),
     [
         ({"points": np.zeros((2, 4, 3))}, "expected arrays points and visible"),
-        ({"points": np.zeros((3, 4, 3)), "visible": np.ones((3, 4))}, "with T = 2"),
-        ({"points": np.zeros((2, 5, 3)), "visible": np.ones((2, 4))}, "with T = 2"),
-        ({"points": np.zeros((2, 4, 3)), "visible": np.ones(2)}, "with T = 2"),
+        ({"points": np.zeros((3, 4, 3)), "visible": np.ones((3, 4))}, r"visible: numbers of shape \(2, any\)"),
+        ({"points": np.zeros((2, 5, 3)), "visible": np.ones((2, 4))}, r"points: numbers of shape \(2, 4, 3\)"),
+        ({"points": np.zeros((2, 4, 3)), "visible": np.ones(2)}, r"visible: numbers of shape \(2, any\), got \(2,\)"),
+        ({"points": np.full((2, 4, 3), "a"), "visible": np.ones((2, 4))}, "points: numbers of shape .* of <U1"),
+        ({"points": np.zeros((2, 4, 3)), "visible": np.ones((2, 4)), "paired": [1, 0]}, "paired: numbers of shape"),
         ({"points": np.array([None])}, "a NumPy file"),
         ({"points": np.zeros((2, 4, 3)), "visible": np.ones((2, 4)), "region": ["smooth"] * 3}, "region of shape"),
     ],
@@ -250,6 +252,16 @@ def test_wrong_tracks_are_rejected(tmp_path, arrays, words):
     with pytest.raises(InputError, match=words) as caught:
         _ = Truth(tmp_path, ["0", "1"]).tracks
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("part", ["depth", "seen"])
+@pytest.mark.parametrize("array", [{"a": np.zeros((2, 2))}, np.full((2, 2), "far"), np.zeros(2)])
+def test_wrong_maps_of_the_truth_are_rejected(tmp_path, part, array):
+    (tmp_path / part).mkdir()
+    with (tmp_path / part / "0.npy").open("wb") as file:
+        np.savez(file, **array) if isinstance(array, dict) else np.save(file, array)
+    with pytest.raises(InputError, match=rf"{part}/0\.npy: expected numbers of shape \(any, any\), got "):
+        getattr(Truth(tmp_path, ["0"]), part)(0)
 
 
 # --- remarks: usable, but suspicious

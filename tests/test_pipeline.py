@@ -19,7 +19,7 @@ from endoprior.cli.run import Run
 from endoprior.core.checks import InputError, quotation
 from endoprior.core.shell import command
 from endoprior.data import load_sequence
-from endoprior.data.files import read_json
+from endoprior.data.reading import read_json
 from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
 from endoprior.model.scene import SingleScene

@@ -299,6 +299,8 @@ BAD = {
     "outside": (first(file_path="/etc/a.png"), "paths from its folder"),
     "no pose": (first(transform_matrix=None), "transform_matrix, 4x4 numbers, got no such key"),
     "pose NaN": (first(transform_matrix=(np.eye(4) * np.nan).tolist()), "NaN or infinity"),
+    "singular pose": (first(transform_matrix=np.diag([0.0, 0, 0, 1]).tolist()), "rotations in the poses"),
+    "projective pose": (first(transform_matrix=np.diag([1.0, 1, 1, 2]).tolist()), "a last row 0 0 0 1"),
     "scaled pose": (first(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "rotations in the poses"),
     "no focal length": (whole(fl_x=None), "fl_x and a PINHOLE, OPENCV or OPENCV_FISHEYE camera, got focal lengths 0"),
     "panorama": (whole(camera_model="EQUIRECTANGULAR"), "got the camera model EQUIRECTANGULAR in frame"),
@@ -335,6 +337,13 @@ BAD_COLMAP = {
     "FOV": ("text", rewrite("cameras.txt", "3 FOV 96 80 1 1 1 1 1\n"), "cameras.txt", "got the camera model FOV"),
     "few": ("text", rewrite("cameras.txt", "3 PINHOLE 96 80 1\n"), "cameras.txt", "4 parameters of PINHOLE, got 1"),
 }
+
+
+def test_images_of_colmap_lie_below_its_folder(tmp_path):
+    folder = write_colmap(tmp_path / "scene", "text")
+    names = folder / "sparse/0/images.txt"
+    names.write_text(names.read_text().replace("frame_00003.png", str(tmp_path / "elsewhere.png")))
+    assert_rejected(folder, "sparse/0/images.txt", "paths from its folder")
 
 
 @pytest.mark.parametrize("case", BAD_COLMAP)

@@ -250,6 +250,7 @@ BAD = {
     "calibration text": (bad_record("camera-calibration", dict.fromkeys("KL KR R T".split(), "x")), RECORD, "n.KL"),
     "right camera": (bad_record("camera-calibration", RAW | {"T": [0, 0, 0]}), RECORD, "T of 0 mm"),
     "shift": (bad_record("camera-calibration", RAW | {"T": [1, 2]}), RECORD, "T, 1x3 numbers"),
+    "ragged shift": (bad_record("camera-calibration", RAW | {"T": [[1], [2, 3]]}), RECORD, "T, 1x3 numbers"),
     "pose NaN": (nan_pose, RECORD, "NaN or infinity"),
     "pose scaled": (bad_record("camera-pose", (2 * np.eye(4)).tolist()), "data/frame_data", "rotations in camera-pose"),
     "focal zero": (bad_geometry("reprojection-matrix", np.eye(4).tolist()), GEOMETRY, "focal lengths > 0"),

@@ -20,8 +20,9 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence, scale_files
 from endoprior.data.images import save_png
-from endoprior.data.known_length import (
+from endoprior.data.scale import (
     SHAPE_STD,
+    Scale,
     length_std,
     parse_known_length,
     relative_length,
@@ -29,7 +30,6 @@ from endoprior.data.known_length import (
     scale_between,
     scale_by_lengths,
 )
-from endoprior.data.scale import Scale
 from endoprior.data.scale_files import finish_scale, write_scale
 from endoprior.data.writer import FrameFiles, SequenceMeta, new_sequence
 from endoprior.prepare import prepare
@@ -219,6 +219,16 @@ def test_what_cannot_be_used_is_one_line_and_changes_nothing(folder, capsys, nam
     assert main(["scale", str(folder), *options]) == 2
     error = capsys.readouterr().err
     assert message.replace("\\", "") in error and "Fix: " in error and error.count("\n") == 1
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("arrays", [{"visible": np.ones(2)}, {"points": np.array(["a"])}, None])
+def test_damaged_points_are_one_line_and_change_nothing(folder, arrays):
+    file = folder / "truth" / "tracks.npz"
+    file.write_bytes(b"damaged") if arrays is None else np.savez(file, **arrays)
+    before = contents(folder)
+    with pytest.raises(InputError, match=r"tracks\.npz: expected"):
+        write_scale(folder, Scale(2.5, 0.07, "known length in frame 1"))
     assert contents(folder) == before
 
 

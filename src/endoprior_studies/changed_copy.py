@@ -13,7 +13,8 @@ from endoprior.core.checks import InputError, input_error
 from endoprior.core.config import DataConfig
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.description import read_description
-from endoprior.data.writer import BACKUP, POSES, note_found_masks, write_mask
+from endoprior.data.poses import POSES
+from endoprior.data.writer import BACKUP, note_found_masks, write_mask
 from endoprior.evaluation.true_masks import SCORES_FILE, TrueMasks, score_masks
 from endoprior.prepare.folder_path import write_folder_path
 from endoprior.system.atomic import whole_folder, write_json

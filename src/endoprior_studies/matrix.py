@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from endoprior.core.checks import InputError, input_error
 from endoprior.core.config_io import to_dict
-from endoprior.data.files import read_parts
+from endoprior.data.reading import read_parts
 from endoprior.evaluation.context import read_frame_scores, read_scores
 from endoprior.evaluation.pictures import fingerprint
 from endoprior.evaluation.true_masks import SCORES_FILE

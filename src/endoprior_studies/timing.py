@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from endoprior.core.config import Config
-from endoprior.data.files import read_own, read_parts
+from endoprior.data.reading import read_own, read_parts
 from endoprior.runs.folder import LOG, SCENE
 from endoprior.runs.log import LOG_EVERY, read_log
 from endoprior.system.atomic import write_json

@@ -17,7 +17,7 @@ from typing import Any
 
 from endoprior.core.checks import InputError
 from endoprior.data.description import read_description
-from endoprior.data.files import read_own, read_parts
+from endoprior.data.reading import read_own, read_parts
 from endoprior.system.atomic import write_json, write_text
 from endoprior.system.console import complain
 

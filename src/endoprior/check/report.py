@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.checks import quotation
 from ..core.geometry import length_unit
-from ..data.files import read_parts
+from ..data.reading import read_parts
 from ..footage.border import CERTAIN
 from .facts import Facts
 from .findings import Finding

@@ -103,7 +103,7 @@ class Poses(Command):
 
     def execute(self) -> None:
         """Find the camera path and write it."""
-        from ..data.writer import POSES
+        from ..data.poses import POSES
         from ..prepare.camera_path.sequence_path import Reading
         from ..prepare.folder_path import write_folder_path
 

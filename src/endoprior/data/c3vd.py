@@ -20,11 +20,11 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .files import list_files, read_table
+from .files import list_files
 from .formats import DatasetFormat
 from .images import read_color, read_values
 from .poses import demand_rotations, world_to_camera
-from .reading import read_text
+from .reading import read_table, read_text
 from .sequence import FrameSequence
 
 TABLE_STEPS_PER_PX = 16

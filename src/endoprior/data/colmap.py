@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from .files import IMAGE_SUFFIXES, entries, named_file
+from .files import IMAGE_SUFFIXES, entries, file_below
 from .formats import DatasetFormat
 from .lens import MODELS, Lens
 from .posed_images import PosedImage, load_posed
+from .poses import POSES
 from .reading import read_bytes, read_text
 from .sequence import FrameSequence
 
@@ -166,7 +167,7 @@ def model_folder(path: Path) -> Path | None:
 
 def is_colmap(path: Path) -> bool:
     """Whether a folder has images and a model, and no poses of its own."""
-    return (path / "images").is_dir() and not (path / "poses_bounds.npy").exists() and model_folder(path) is not None
+    return (path / "images").is_dir() and not (path / POSES).exists() and model_folder(path) is not None
 
 
 def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
@@ -180,7 +181,10 @@ def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
     siblings = entries(model.parent) if model.name.isdigit() else []
     if others := sorted(each.name for each in siblings if each != model and each.name.isdigit()):
         remarks.append(f"{model}: other parts of the model, {', '.join(others)}, are not used")
-    posed = [PosedImage(named_file(path / "images", each.name), each.lens, each.world_to_camera) for each in registered]
+    posed = [
+        PosedImage(file_below(path / "images", each.name, files[1]), each.lens, each.world_to_camera)
+        for each in registered
+    ]
     own = {file.name for file in entries(path / "images") if file.suffix.lower() in IMAGE_SUFFIXES}
     if missing := len(own - {each.file.name for each in posed}):
         remarks.append(f"{model}: {missing} of {len(own)} images have no pose and are left out")

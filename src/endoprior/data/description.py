@@ -18,7 +18,7 @@ from ..core.checks import InputError, input_error
 from ..core.config_io import from_dict
 from ..core.shell import Options, command
 from ..system.atomic import write_json
-from .files import read_json
+from .reading import read_json
 
 MIN_NUMBER, MAX_NUMBER = 1e-6, 1e6  # range of every number in the file
 TOOLS_FOUND = "tools found"

@@ -21,7 +21,7 @@ from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import frame_weights, intrinsics_of, read_description
-from .files import CONFIDENCE, IMAGE_SUFFIXES, list_files, read_json
+from .files import CONFIDENCE, IMAGE_SUFFIXES, list_files
 from .formats import DatasetFormat
 from .frame_files import Kind, files_of_images, missing_numbers, one_per_frame
 from .images import (
@@ -33,17 +33,22 @@ from .images import (
     read_depth_file,
     read_share,
     read_tool_mask,
-    read_values,
 )
-from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, scale_of, world_to_camera
-from .reading import read_numpy
+from .poses import (
+    MATRIX_FILE,
+    POSES,
+    focal_at,
+    identity_poses,
+    lens_entries,
+    read_camera_matrix,
+    read_poses_bounds,
+    world_to_camera,
+)
+from .reading import read_json
 from .scale import described_scale
 from .sequence import FrameSequence, is_test_frame
 from .truth import Truth, open_right_eye
 
-POSES = "poses_bounds.npy"
-POSES_HINT = "write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
-STILL_HINT = f"{POSES_HINT[:-1]}; for a static camera, set data.format to plain."
 ASSUMED_FOCAL = 0.9
 """Focal length in image widths if none is given: a field of view of 58 degrees, typical of endoscopes."""
 RAW_STEREOMIS = "StereoCalibration.ini"
@@ -282,31 +287,7 @@ def _lens_beside(path: Path, layout: Layout) -> dict[str, float]:
     """The intrinsics in the layout's `lens_file`, as `sequence.json` names them; empty without."""
     if layout.lens_file is None or not (path / layout.lens_file).is_file():
         return {}
-    matrix = read_camera_matrix(path / layout.lens_file)
-    return {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
-
-
-def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
-    """(N, 3, 5) camera-to-world [R | t | (height, width, focal)] from `poses_bounds.npy`, checked."""
-    if not path.exists():
-        raise input_error(path, "camera poses", "no such file", STILL_HINT)
-    stored = read_numpy(path, "a NumPy file", POSES_HINT)
-    if not isinstance(stored, np.ndarray) or stored.shape != (num_frames, 17):
-        raise input_error(path, f"shape ({num_frames}, 17)", str(getattr(stored, "shape", "an archive")), POSES_HINT)
-    if not np.issubdtype(stored.dtype, np.number) or not np.isfinite(stored[:, :15].astype(np.float64)).all():
-        raise input_error(path, "finite numbers", "NaN, infinity or other values", POSES_HINT)
-    poses = stored[:, :15].astype(np.float64).reshape(-1, 3, 5)
-    demand_rotations(path, poses[:, :, :3], "columns 0-2", POSES_HINT)
-    return poses
-
-
-def focal_at(path: Path, poses: NDArray[np.float64], size: Size, remarks: list[str]) -> float:
-    """Focal length, px, of images of that (width, height), from the first of the stored poses of `poses_bounds.npy`."""
-    height, width, focal = poses[0, :, 4].tolist()
-    if focal <= 0:
-        raise input_error(path, "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
-    fix = "write the size and focal length of these images there, or fx, fy, cx, cy into sequence.json."
-    return focal * scale_of(path, (width, height), size, focal, fix, remarks)
+    return lens_entries(read_camera_matrix(path / layout.lens_file))
 
 
 def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
@@ -335,12 +316,7 @@ def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
     fact_files, lens = [path / "split.json"], path / "intrinsics.npy"
     if lens.exists():
         fact_files.append(lens)
-        matrix = read_values(lens)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
-            hint = "write the 3x3 camera matrix of the rectified images."
-            raise input_error(lens, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
-        fx, fy, cx, cy = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        facts |= {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5}  # pixel centers of the file are integers
+        facts |= lens_entries(read_camera_matrix(lens))
     return load_endonerf(path, cfg, facts=facts, fact_files=fact_files)
 
 

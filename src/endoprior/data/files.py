@@ -1,22 +1,16 @@
-"""Files of a dataset folder: what their names say and their order; JSON and tables of numbers."""
+"""Files of a dataset folder: what their names say, and their order."""
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from string import ascii_lowercase, ascii_uppercase
-from typing import Any, get_origin
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..core.checks import InputError, input_error, similar_name
-from ..core.config_io import value_of
+from ..core.checks import input_error, similar_name
 from ..core.shell import quoted
-from .reading import ACCESS_HINT, read_text
+from .reading import ACCESS_HINT
 
 DECIMAL = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 LETTERED, ALPHABETS = re.compile("#[A-Za-z]$"), (ascii_lowercase, ascii_uppercase)
@@ -211,75 +205,9 @@ def named_file(folder: Path, name: str) -> Path:
     return literal if "\\" not in name or literal.exists() else folder / portable(name)
 
 
-def read_json(
-    path: Path, fix: str = "correct it or remove it.", expected: str = "a JSON object", kind: type = dict
-) -> Any:
-    """The object in a JSON file; of another `kind`, its list."""
-    try:
-        stored = json.loads(read_text(path, expected, fix))
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise input_error(path, expected, str(error).split("\n")[0], fix) from None
-    if not isinstance(stored, kind):
-        raise input_error(path, expected, type(stored).__name__, fix)
-    return stored
-
-
-def read_own(path: Path, hint: Any, fix: str) -> Any:
-    """The contents of a JSON file that this program wrote, of a type as `core.config_io.value_of` takes it.
-
-    Another version, another program or a disk may have changed it: it is checked as if a stranger had written it.
-    """
-    is_list = get_origin(hint) is tuple
-    stored = read_json(path, fix, "a JSON list" if is_list else "a JSON object", list if is_list else dict)
-    return of_type(path, hint, stored, "file", fix)
-
-
-def read_parts(path: Path, parts: Mapping[str, Any], fix: str) -> dict[str, Any]:
-    """As `read_own`, of an object that has these parts, each of its type, and others, which are not looked at."""
-    stored = read_json(path, fix)
-    for name, hint in parts.items():
-        if name not in stored:
-            raise input_error(path, f"an entry {name}", "none", fix)
-        stored[name] = of_type(path, hint, stored[name], name, fix)
-    return stored
-
-
-def of_type(path: Path, hint: Any, value: Any, where: str, fix: str) -> Any:
-    """The value that was found somewhere in a file, of that type; InputError about the file."""
-    try:
-        return value_of(hint, value, where)
-    except InputError as error:
-        problem = str(error).split(". Fix: ")[0]
-        raise InputError(f"{path}: {problem}. Fix: {fix[:1].upper()}{fix[1:]}") from None
-
-
-def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """The finite matrix `key` of an object read from `path`; dots in the key go into nested objects."""
-    value: Any = stored
-    for part in key.split("."):
-        value = value.get(part) if isinstance(value, dict) else None
-    want, fix = f"{key}, {shape[0]}x{shape[1]} numbers", "process the dataset again."
-    if value is None:
-        raise input_error(path, want, "no such key", fix)
-    try:
-        matrix = np.asarray(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
-    if matrix.shape != shape or not np.isfinite(matrix).all():
-        raise input_error(path, want, "NaN or infinity" if matrix.shape == shape else f"shape {matrix.shape}", fix)
-    return matrix
-
-
-def read_table(path: Path, fix: str) -> NDArray[np.float64]:
-    """(N, K) numbers of a text file, separated by commas or blanks, one row per line; '#' starts a comment."""
-    lines = read_text(path, "rows of numbers", fix).splitlines()
-    try:
-        rows = [re.split(r"[,\s]+", line.split("#")[0].strip(", \t")) for line in lines]
-        numbers = [[float(entry) for entry in row] for row in rows if row != [""]]
-    except ValueError as error:
-        raise input_error(path, "rows of numbers", str(error).split("\n")[0], fix) from None
-    if not numbers or len({len(row) for row in numbers}) != 1:
-        raise input_error(path, "rows of equally many numbers", "other rows", fix)
-    return np.array(numbers)
+def file_below(folder: Path, name: str, source: Path) -> Path:
+    """As `named_file`; InputError about `source`, which names the file, for an absolute path to another folder."""
+    found = named_file(folder, name)
+    if PureWindowsPath(name).drive or not found.is_relative_to(folder):
+        raise input_error(source, "paths from its folder", name[:80], "write paths relative to the file.")
+    return found

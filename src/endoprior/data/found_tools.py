@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..system.atomic import write_json
-from .files import read_json
+from .reading import read_json
 
 FILE = "tool_masks.json"
 UNCERTAIN = 0.5  # Masks of a lower confidence should be looked at

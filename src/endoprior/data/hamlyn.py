@@ -17,12 +17,11 @@ from ..core.ranges import evenly_spaced
 from ..core.types import Camera
 from ..footage.border import find_outside
 from .assemble import Pixels, assemble, kept_frames
-from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
 from .formats import DatasetFormat
 from .frame_files import Kind, files_of_images
 from .images import read_color, read_depth_file, read_tool_mask
-from .poses import MATRIX_FILE, identity_poses, matrix_of_images, read_camera_matrix
+from .poses import MATRIX_FILE, POSES, focal_at, identity_poses, matrix_of_images, read_camera_matrix, read_poses_bounds
 from .sequence import FrameSequence
 
 FULL_SIZE = (640, 480)
@@ -109,7 +108,7 @@ def _forplane_matrix(
 ) -> tuple[NDArray[np.float64], Path]:
     """(3, 3) K, px with centers at halves, of the images before the crop, and the file that it comes from."""
     width, height = size
-    stored, poses = path / MATRIX_FILE, path / "poses_bounds.npy"
+    stored, poses = path / MATRIX_FILE, path / POSES
     if stored.exists():
         if poses.exists():
             remarks.append(f"{poses}: not used; {MATRIX_FILE} is the calibration")
@@ -154,7 +153,7 @@ def is_hamlyn(path: Path) -> bool:
     own_depth = any((path / name).is_dir() for name in ("gt_depth", "pred_disp"))
     own_camera = (path / MATRIX_FILE).exists() and ((path / "gt_masks").is_dir() or _is_named(path))
     # A folder that this program prepared from a Hamlyn video has a sequence.json and no empty columns.
-    bare = (path / "poses_bounds.npy").exists() and not (path / "sequence.json").exists()
+    bare = (path / POSES).exists() and not (path / "sequence.json").exists()
     return (path / "images").is_dir() and (own_depth or own_camera or (bare and _is_named(path)))
 
 

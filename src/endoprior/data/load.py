@@ -16,7 +16,7 @@ from ..core.checks import InputError, input_error, number_ranges, or_did_you_mea
 from ..core.config import DataConfig
 from ..core.shell import command, quoted
 from .endonerf import load_endonerf
-from .files import entries, or_neighbor, read_json
+from .files import entries, or_neighbor
 from .formats import REGISTRY, needs_depth, recognizing
 from .image_folders import (
     beside,
@@ -25,7 +25,7 @@ from .image_folders import (
     is_footage,
     ways_to_prepare,
 )
-from .reading import kind_of
+from .reading import kind_of, read_json
 from .sequence import FrameSequence
 from .video_files import VIDEO_SUFFIXES, is_video
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
-from .files import named_file, read_json, read_matrix
+from .files import file_below
 from .formats import DatasetFormat
 from .images import read_color
 from .lens import COEFFICIENTS, Lens
 from .posed_images import PosedImage, load_posed
+from .poses import POSES, ROTATION_TOLERANCE, demand_rotations
+from .reading import read_json, read_matrix
 from .sequence import FrameSequence
 
 FILE = "transforms.json"
@@ -34,7 +36,7 @@ TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL camera axes (x right,
 
 def is_nerfstudio(path: Path) -> bool:
     """Whether a folder has `transforms.json`, and is not complete in the EndoNeRF layout."""
-    complete = all((path / name).exists() for name in ("poses_bounds.npy", "masks", "depth"))
+    complete = all((path / name).exists() for name in (POSES, "masks", "depth"))
     return (path / FILE).is_file() and not complete
 
 
@@ -42,8 +44,20 @@ def load_nerfstudio(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open the images that the file names."""
     file = path / FILE
     stored, frames = _frames(file)
+    to_world = [_to_world(file, frame) for frame in frames]
+    demand_rotations(file, np.stack(to_world)[:, :3, :3], "the poses", "export them again.")
     lenses: dict[str, Lens] = {}
-    posed = [_posed(path, file, stored, frame, index, lenses) for index, frame in enumerate(frames)]
+    posed = []
+    for index, (frame, pose) in enumerate(zip(frames, to_world, strict=True)):
+        image = _image(path, file, frame, index)
+        lens = _lens(file, image, stored | frame, index, lenses)
+        mask, depth = (
+            file_below(path, name, file) if isinstance(name := frame.get(key), str) else None
+            for key in ("mask_path", "depth_file_path")
+        )
+        time = frame.get("time")
+        time = time if isinstance(time, int | float) else None
+        posed.append(PosedImage(image, lens, np.linalg.inv(pose).astype(np.float64), mask, depth, time))
     return load_posed(path, cfg, file, posed, [file], [])
 
 
@@ -75,26 +89,20 @@ def _to_world(file: Path, frame: dict[str, Any]) -> NDArray[np.float64]:
     shape = (3, 4) if isinstance(rows, list) and len(rows) == 3 else (4, 4)
     to_world = np.eye(4)
     to_world[: shape[0]] = read_matrix(file, frame, "transform_matrix", shape)
+    if not np.allclose(to_world[3], (0, 0, 0, 1), rtol=0, atol=ROTATION_TOLERANCE):
+        raise input_error(file, "poses with a last row 0 0 0 1", f"{to_world[3].tolist()}", FIX)
     return to_world @ TO_OPENCV
 
 
-def _posed(
-    path: Path, file: Path, stored: dict[str, Any], frame: dict[str, Any], index: int, lenses: dict[str, Lens]
-) -> PosedImage:
-    """One image; `lenses` keeps the same object for the same numbers."""
+def _image(path: Path, file: Path, frame: dict[str, Any], index: int) -> Path:
+    """The image of a frame."""
+    image = file_below(path, _name(file, frame, index), file)
+    return image if image.suffix else image.with_name(f"{image.name}.png")  # without a suffix in Blender's data
 
-    def below(name: str) -> Path:
-        found = named_file(path, name)
-        if PureWindowsPath(name).drive or not found.is_relative_to(path):
-            raise input_error(file, "paths from its folder", name[:80], "write paths relative to the file.")
-        return found
 
-    image = below(_name(file, frame, index))
-    if not image.suffix:  # as in Blender's data
-        image = image.with_name(f"{image.name}.png")
-    named = [frame.get(key) for key in ("mask_path", "depth_file_path")]
-    mask, depth = (below(name) if isinstance(name, str) else None for name in named)
-    values, model = _parameters(file, image, stored | frame)
+def _lens(file: Path, image: Path, stored: dict[str, Any], index: int, lenses: dict[str, Lens]) -> Lens:
+    """The lens of a frame, whose own entries are among the `stored` ones; `lenses` keeps one object per lens."""
+    values, model = _parameters(file, image, stored)
     key = repr((model, sorted(values.items())))
     if key not in lenses:
         try:
@@ -102,10 +110,7 @@ def _posed(
         except ValueError as error:
             want = "fl_x and a PINHOLE, OPENCV or OPENCV_FISHEYE camera"
             raise input_error(file, want, f"{error} in frame {index}", UNDISTORT) from None
-    time = frame.get("time")
-    time = time if isinstance(time, int | float) else None
-    to_camera = np.linalg.inv(_to_world(file, frame)).astype(np.float64)
-    return PosedImage(image, lenses[key], to_camera, mask, depth, time)
+    return lenses[key]
 
 
 def _parameters(file: Path, image: Path, stored: dict[str, Any]) -> tuple[dict[str, float], str]:

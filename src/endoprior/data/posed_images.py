@@ -18,7 +18,7 @@ from .files import in_order, list_files
 from .frame_files import files_of_images
 from .images import DEPTH_SUFFIXES, read_color, read_depth_file, read_tool_mask
 from .lens import Lens, Undistorter
-from .poses import demand_rotations, scale_of
+from .poses import scale_of
 from .sequence import FrameSequence
 
 MM_PER_M = 1000.0
@@ -50,8 +50,6 @@ def load_posed(
         remarks: what is unusual, so far.
     """
     posed = _sorted(_present(source, posed, remarks))
-    rotations = np.stack([each.world_to_camera[:3, :3] for each in posed])
-    demand_rotations(source, rotations, "the poses", "export them again.")
     height, width = read_color(posed[0].file).shape[:2]
     size = (width, height)
     lenses: dict[int, Undistorter] = {}

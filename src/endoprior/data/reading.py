@@ -1,29 +1,32 @@
-"""Read files of users: bytes, text, arrays and YAML. Regular files only, of bounded size; nothing in them is executed.
+"""Read files of users: bytes, text, arrays, YAML, JSON and tables.
 
-A few lines of YAML with nested anchors can stand for billions of entries, and nesting can exhaust the stack. All
-readers raise InputError for a file that is missing, unreadable, no regular file (a pipe could block forever), too
-large, or of another kind.
+Regular files only, of bounded size; nothing in them is executed. A few lines of YAML with nested anchors can stand for
+billions of entries, and nesting can exhaust the stack. All readers raise InputError for a file that is missing,
+unreadable, no regular file (a pipe could block forever), too large, or of another kind.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import math
+import re
 import stat
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from lzma import LZMAError
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_origin
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
+from ..core.config_io import value_of
 
 MAX_BYTES = 1 << 30  # largest size of one file, also after decompression
 MAX_PIXELS = 64_000_000  # of one image; 7680x4320 has half as many. `system/surroundings.py` tells OpenCV the same
@@ -208,3 +211,77 @@ def _unfolded(node: yaml.Node, known: dict[int, int], depth: int) -> int:
         parts = [part for pair in parts for part in pair]
     known[id(node)] = 1 + sum(_unfolded(part, known, depth + 1) for part in parts)
     return known[id(node)]
+
+
+def read_json(
+    path: Path, fix: str = "correct it or remove it.", expected: str = "a JSON object", kind: type = dict
+) -> Any:
+    """The object in a JSON file; of another `kind`, its list."""
+    try:
+        stored = json.loads(read_text(path, expected, fix))
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise input_error(path, expected, str(error).split("\n")[0], fix) from None
+    if not isinstance(stored, kind):
+        raise input_error(path, expected, type(stored).__name__, fix)
+    return stored
+
+
+def read_own(path: Path, hint: Any, fix: str) -> Any:
+    """The contents of a JSON file that this program wrote, of a type as `core.config_io.value_of` takes it.
+
+    Another version, another program or a disk may have changed it: it is checked as if a stranger had written it.
+    """
+    is_list = get_origin(hint) is tuple
+    stored = read_json(path, fix, "a JSON list" if is_list else "a JSON object", list if is_list else dict)
+    return of_type(path, hint, stored, "file", fix)
+
+
+def read_parts(path: Path, parts: Mapping[str, Any], fix: str) -> dict[str, Any]:
+    """As `read_own`, of an object that has these parts, each of its type, and others, which are not looked at."""
+    stored = read_json(path, fix)
+    for name, hint in parts.items():
+        if name not in stored:
+            raise input_error(path, f"an entry {name}", "none", fix)
+        stored[name] = of_type(path, hint, stored[name], name, fix)
+    return stored
+
+
+def of_type(path: Path, hint: Any, value: Any, where: str, fix: str) -> Any:
+    """The value that was found somewhere in a file, of that type; InputError about the file."""
+    try:
+        return value_of(hint, value, where)
+    except InputError as error:
+        problem = str(error).split(". Fix: ")[0]
+        raise InputError(f"{path}: {problem}. Fix: {fix[:1].upper()}{fix[1:]}") from None
+
+
+def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """The finite matrix `key` of an object read from `path`; dots in the key go into nested objects."""
+    value: Any = stored
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    want, fix = f"{key}, {shape[0]}x{shape[1]} numbers", "process the dataset again."
+    if value is None:
+        raise input_error(path, want, "no such key", fix)
+    try:
+        matrix = np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape != shape or not np.isfinite(matrix).all():
+        raise input_error(path, want, "NaN or infinity" if matrix.shape == shape else f"shape {matrix.shape}", fix)
+    return matrix
+
+
+def read_table(path: Path, fix: str) -> NDArray[np.float64]:
+    """(N, K) numbers of a text file, separated by commas or blanks, one row per line; '#' starts a comment."""
+    lines = read_text(path, "rows of numbers", fix).splitlines()
+    try:
+        rows = [re.split(r"[,\s]+", line.split("#")[0].strip(", \t")) for line in lines]
+        numbers = [[float(entry) for entry in row] for row in rows if row != [""]]
+    except ValueError as error:
+        raise input_error(path, "rows of numbers", str(error).split("\n")[0], fix) from None
+    if not numbers or len({len(row) for row in numbers}) != 1:
+        raise input_error(path, "rows of equally many numbers", "other rows", fix)
+    return np.array(numbers)

@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.shell import command
 from ..system.atomic import whole_file, whole_folder, write_json
 from .description import PATH_RECORD, SCALE_PENDING, read_description
-from .files import read_json, read_parts
+from .poses import POSES, scaled_poses
+from .reading import read_json, read_numpy, read_parts
 from .scale import Scale, demand_relative, described_scale
-from .writer import POSES, demand_writable
+from .writer import demand_writable
 
 LENGTHS_OF_PATH = {"translation_std_mm"}  # lists of lengths in `camera_path.json`
 TRACKS = Path("truth", "tracks.npz")  # known points, which `prepare --stir` lifts by the depth
@@ -68,13 +70,6 @@ def finish_scale(folder: Path) -> bool:
     return True
 
 
-def scaled_poses(table: NDArray[np.float64], ratio: float) -> NDArray[np.float64]:
-    """(T, 17) rows of `poses_bounds.npy` with their translations and bounds multiplied."""
-    out = np.array(table, np.float64)
-    out[:, [3, 8, 13, 15, 16]] *= ratio
-    return out
-
-
 def scaled_record(record: dict[str, Any], ratio: float) -> dict[str, Any]:
     """The content of `camera_path.json` with its lengths multiplied."""
 
@@ -85,21 +80,25 @@ def scaled_record(record: dict[str, Any], ratio: float) -> dict[str, Any]:
 
 
 def _read_table(file: Path) -> NDArray[np.float64]:
-    table = np.load(file, allow_pickle=False)
-    if table.ndim != 2 or table.shape[1] != 17:
-        raise input_error(file, "rows of 17 numbers", f"shape {table.shape}", "`endoprior poses DATA`.")
+    fix = f"find them again: `{command('poses', file.parent)}`."
+    table = read_numpy(file, "a NumPy file", fix)
+    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "iuf":
+        raise input_error(file, "rows of 17 numbers", "something else", fix)
     return table
 
 
 def _read_path(file: Path) -> dict[str, Any]:
-    stored, fix = read_json(file), "remove it, or find the path again: `endoprior poses DATA`."
+    stored, fix = read_json(file), f"remove it, or find the path again: `{command('poses', file.parent)}`."
     lengths = {name: tuple[float | int | None, ...] for name in LENGTHS_OF_PATH & stored.keys()}
     return read_parts(file, lengths, fix)
 
 
 def _scale_tracks(file: Path, target: Path, ratio: float) -> None:
-    with np.load(file, allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    arrays["points"] = (arrays["points"] * ratio).astype(arrays["points"].dtype)
+    fix = "remove it, or write it again."
+    arrays = read_numpy(file, "a NumPy file", fix)
+    points = arrays.get("points") if isinstance(arrays, dict) else None
+    if not isinstance(arrays, dict) or points is None or points.dtype.kind != "f":
+        raise input_error(file, "an array points", "none of real numbers", fix)
+    arrays["points"] = (points * ratio).astype(points.dtype)
     with whole_file(target) as temporary:
-        np.savez_compressed(temporary, **arrays)
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)

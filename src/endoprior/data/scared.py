@@ -20,10 +20,11 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .files import list_files, read_json, read_matrix
+from .files import list_files
 from .formats import DatasetFormat
 from .images import read_color, read_values
 from .poses import demand_rotations
+from .reading import read_json, read_matrix
 from .sequence import FrameSequence
 
 STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}  # published frame stride of each dataset number
@@ -169,8 +170,11 @@ def _rectifying_rotation(record: Path, about: dict[str, Any], size: tuple[int, i
     if not isinstance(calibration, dict) or any(key not in calibration for key in RAW_STEREO):
         return None
     left, right, turn = (read_matrix(record, about, f"camera-calibration.{key}", (3, 3)) for key in RAW_STEREO[:3])
-    flat = {"T": np.ravel(calibration["T"])[None].tolist()}  # in a row or in a column
-    shift = read_matrix(record, flat, "T", (1, 3))[0]
+    stored = calibration["T"]
+    if isinstance(stored, list) and all(isinstance(row, list) and len(row) == 1 for row in stored):
+        stored = [row[0] for row in stored]  # a column
+    rows = stored if isinstance(stored, list) and len(stored) == 1 else [stored]
+    shift = read_matrix(record, {"T": rows}, "T", (1, 3))[0]
     if not shift.any():
         raise input_error(record, "a right camera beside the left one", "T of 0 mm", HINT)
     straight = np.zeros(5)

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..core.geometry import FARTHEST_MM, Strain
 from .description import MAX_NUMBER, MIN_NUMBER, is_number
-from .files import IMAGE_SUFFIXES, files_with, read_json
+from .files import IMAGE_SUFFIXES, files_with
 from .frame_files import match_names
 from .images import Size, read_color, read_header
 from .pixels import shrunk_color
 from .poses import ROTATION_TOLERANCE, demand_rotations
-from .reading import read_bytes, read_numpy
+from .reading import read_bytes, read_json, read_numpy
 
 _AGAIN = "write the truth again."
 
@@ -51,10 +51,15 @@ class Truth:
         self.folder = folder
         self._names = names
 
-    def _array(self, name: str) -> NDArray | dict[str, NDArray] | None:
+    def _stored(self, name: str) -> NDArray | dict[str, NDArray] | None:
         """What a NumPy file of the folder holds; None without."""
         path = self.folder / name
         return read_numpy(path, "a NumPy file", _AGAIN) if path.exists() else None
+
+    def _map(self, name: str) -> NDArray | None:
+        """The numbers (H, W) of a NumPy file of the folder; None without."""
+        stored = self._stored(name)
+        return None if stored is None else _numbers(self.folder / name, stored, (None, None))
 
     def tissue(self, index: int) -> NDArray[np.uint8] | None:
         """(H, W, 3) image of frame `index` without the tool, 0..255."""
@@ -74,12 +79,14 @@ class Truth:
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
         path = self.folder / "depth" / f"{self._names[index]}.npy"
-        return np.asarray(read_numpy(path, "a NumPy file", _AGAIN), np.float32) if path.parent.is_dir() else None
+        if not path.parent.is_dir():
+            return None
+        return _numbers(path, read_numpy(path, "a NumPy file", _AGAIN), (None, None)).astype(np.float32)
 
     def seen(self, index: int) -> NDArray[np.bool_] | None:
         """(H, W) True behind the tool of frame `index` where some training frame shows that tissue; None without."""
-        stored = self._array(f"seen/{self._names[index]}.npy")
-        return None if stored is None else np.asarray(stored, bool)
+        stored = self._map(f"seen/{self._names[index]}.npy")
+        return None if stored is None else stored.astype(bool)
 
     @cached_property
     def side_poses(self) -> dict[str, NDArray[np.float64]]:
@@ -103,20 +110,16 @@ class Truth:
         Both are 0 where the endoscope does not see the tissue.
         """
         file = f"side/{name}/{self._names[index]}"
-        depth = self._array(f"{file}.npy")
-        return None if depth is None else (read_color(self.folder / f"{file}.png"), np.asarray(depth, np.float32))
+        depth = self._map(f"{file}.npy")
+        return None if depth is None else (read_color(self.folder / f"{file}.png"), depth.astype(np.float32))
 
     @cached_property
     def camera_to_world(self) -> NDArray[np.float64] | None:
         """(T, 4, 4) true pose of each frame's camera, mm, OpenCV axes; world axes may differ from the sequence's."""
-        path, stored = self.folder / "camera_to_world.npy", self._array("camera_to_world.npy")
+        path, stored = self.folder / "camera_to_world.npy", self._stored("camera_to_world.npy")
         if stored is None:
             return None
-        shape = (len(self._names), 4, 4)
-        if isinstance(stored, dict) or stored.dtype.kind not in "iuf" or stored.shape != shape:
-            got = "several arrays" if isinstance(stored, dict) else f"{stored.shape} of {stored.dtype}"
-            raise input_error(path, f"numbers of shape {shape}", got, _AGAIN)
-        poses = stored.astype(np.float64)
+        poses = _numbers(path, stored, (len(self._names), 4, 4)).astype(np.float64)
         if not (np.abs(poses) <= FARTHEST_MM).all():  # NaN fails too
             raise input_error(path, f"finite numbers of at most {FARTHEST_MM:g}", "others", _AGAIN)
         if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=ROTATION_TOLERANCE):
@@ -127,25 +130,24 @@ class Truth:
     @cached_property
     def tracks(self) -> Tracks | None:
         """All tracks, or None."""
-        path, stored = self.folder / "tracks.npz", self._array("tracks.npz")
+        path, stored = self.folder / "tracks.npz", self._stored("tracks.npz")
         if stored is None:
             return None
         if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
             raise input_error(path, "arrays points and visible", got, _AGAIN)
-        points, visible = np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool)
-        region = np.asarray(stored["region"], str) if "region" in stored else None
-        if visible.ndim != 2 or len(visible) != len(self._names) or points.shape != (*visible.shape, 3):
-            want = f"shapes (T, P, 3) and (T, P) with T = {len(self._names)}"
-            raise input_error(path, want, f"{points.shape} and {visible.shape}", _AGAIN)
+        visible = _numbers(path, stored["visible"], (len(self._names), None), "visible").astype(bool)
+        points = _numbers(path, stored["points"], (*visible.shape, 3), "points").astype(np.float32)
+        paired = _numbers(path, stored.get("paired", np.array(True)), (), "paired")
+        region = stored["region"].astype(str) if "region" in stored else None
         if region is not None and region.shape != visible.shape[1:]:
             raise input_error(path, f"a region of shape {visible.shape[1:]}", f"{region.shape}", _AGAIN)
-        return Tracks(points, visible, bool(stored.get("paired", True)), region)
+        return Tracks(points, visible, bool(paired), region)
 
     @cached_property
     def deformation(self) -> Deformation | None:
         """How the tissue of the tracks is deformed, or None."""
-        path, stored, tracks = self.folder / "mechanics.npz", self._array("mechanics.npz"), self.tracks
+        path, stored, tracks = self.folder / "mechanics.npz", self._stored("mechanics.npz"), self.tracks
         if stored is None:
             return None
         if tracks is None:
@@ -153,13 +155,23 @@ class Truth:
         sizes = {"displacement": 3, "stretch": 2, "direction": 3}
         found = stored if isinstance(stored, dict) else {}
         for name, size in sizes.items():
-            shape = (*tracks.visible.shape, size)
-            array = found.get(name, np.zeros(0))
-            if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
-                got = f"{array.shape} of {array.dtype}" if name in found else "no such array"
-                raise input_error(path, f"{name}: finite numbers of shape {shape}", got, _AGAIN)
+            array = _numbers(path, found.get(name), (*tracks.visible.shape, size), name)
+            if not np.isfinite(array).all():
+                raise input_error(path, f"{name}: finite numbers", "NaN or infinity", _AGAIN)
         strain = Strain(*(found[name].astype(np.float64) for name in ("stretch", "direction")))
         return Deformation(found["displacement"].astype(np.float32), strain)
+
+
+def _numbers(path: Path, stored: Any, shape: tuple[int | None, ...], name: str = "") -> NDArray:
+    """What a NumPy file holds, or its array of that name, if it is one array of real numbers of a shape; None: any."""
+    known = isinstance(stored, np.ndarray) and stored.dtype.kind in "biuf" and stored.ndim == len(shape)
+    if known and all(want in (None, got) for want, got in zip(shape, stored.shape, strict=True)):
+        return stored
+    got = "no such array" if stored is None else "several arrays"
+    if isinstance(stored, np.ndarray):
+        got = f"{stored.shape} of {stored.dtype}"
+    sides = ", ".join("any" if side is None else str(side) for side in shape)
+    raise input_error(path, f"{f'{name}: ' if name else ''}numbers of shape ({sides})", got, _AGAIN)
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,12 @@ from ..core.checks import input_error
 from ..system.atomic import remove_leftovers, temporary_sibling, whole_file, whole_folder, write_json
 from .description import TOOLS_FOUND, read_description
 from .images import decode_image, encode_png, read_tool_mask, save_png
+from .poses import POSES, depth_bounds, pose_table
 from .scale import Scale
 from .sequence import FrameSequence
 
 NOTE = "changes.json"  # In the folder of the original masks: the files that were changed, and by how many pixels
-POSES, BACKUP = "poses_bounds.npy", "poses_bounds_before.npy"
+BACKUP = "poses_bounds_before.npy"
 
 
 def replace_masks(sequence: FrameSequence, tool_masks: Mapping[int, NDArray[np.bool_]]) -> None:
@@ -90,24 +91,6 @@ def found_source(with_tools: float, followed_by: str = "") -> str:
     """The source of masks that a program found in a share of the frames, 0..1, and another followed, if any."""
     found = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
     return f"{found}, followed by {followed_by}" if followed_by else found
-
-
-def pose_table(
-    camera_to_world: NDArray[np.float64], height: int, width: int, focal: float, bounds: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(T, 17) rows of `poses_bounds.npy`: 3x5 [R | t | (height, width, focal)], row-major, then near and far.
-
-    `camera_to_world` is (T, 4, 4) in mm, with OpenCV axes; `bounds` (T, 2) the nearest and farthest depth, mm.
-    """
-    count = len(camera_to_world)
-    size = np.broadcast_to([[height], [width], [focal]], (count, 3, 1))
-    return np.concatenate([np.concatenate([camera_to_world[:, :3], size], 2).reshape(count, 15), bounds], 1)
-
-
-def depth_bounds(stored: NDArray, scale: float) -> tuple[float, float]:
-    """Nearest and farthest measured depth, mm, of stored values (0: missing); (0, 0) without any."""
-    measured = stored[stored > 0]
-    return (float(measured.min() * scale), float(measured.max() * scale)) if measured.size else (0.0, 0.0)
 
 
 def demand_writable(folder: Path) -> None:
@@ -266,7 +249,7 @@ class FrameFiles:
         depths = [self.file("depth", index) for index in range(self.count)]
         stored = (decode_image(path, None) if path.exists() else np.zeros(0, np.uint16) for path in depths)
         bounds = np.array([depth_bounds(each, meta.depth_scale) for each in stored])
-        self.write_array("poses_bounds.npy", pose_table(cameras, meta.height, meta.width, meta.fx, bounds))
+        self.write_array(POSES, pose_table(cameras, meta.height, meta.width, meta.fx, bounds))
         fixed = {"format_version": 1, "depth_unit": "mm", "mask_tool_value": TOOL_VALUE}
         known = asdict(replace(meta, scale=None))
         del known["scale"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..data import FrameList, FrameSequence, Split
-from ..data.files import of_type, read_own, read_parts
+from ..data.reading import of_type, read_own, read_parts
 from ..model.scene import RenderedScene, Scene
 from ..system.atomic import write_json
 from ..system.memory import BoundedCache, cache_bytes

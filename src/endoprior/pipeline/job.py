@@ -18,7 +18,8 @@ from ..core.config import Config
 from ..core.config_io import to_dict
 from ..core.shell import Options, changed_options, command
 from ..data import load_sequence
-from ..data.files import entries, read_json
+from ..data.files import entries
+from ..data.reading import read_json
 from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import input_facts, source_facts

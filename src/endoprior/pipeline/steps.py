@@ -27,8 +27,8 @@ from ..core.shell import command, command_of, quoted
 from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
 from ..data.description import MOTION, read_description
-from ..data.files import read_json
 from ..data.pixels import measured_share
+from ..data.reading import read_json
 from ..evaluation.context import RenderedFrame, RenderedFrames, SceneFrames
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data

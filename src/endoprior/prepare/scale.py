@@ -16,8 +16,14 @@ from ..core.ranges import evenly_spaced
 from ..data import load_sequence
 from ..data.description import PATH_RECORD, read_description
 from ..data.images import read_depth
-from ..data.known_length import parse_known_length, scale_by_lengths
-from ..data.scale import Scale, demand_plausible, demand_relative, described_scale
+from ..data.scale import (
+    Scale,
+    demand_plausible,
+    demand_relative,
+    described_scale,
+    parse_known_length,
+    scale_by_lengths,
+)
 from ..data.scale_files import finish_scale, scaled_record, write_scale
 from ..data.writer import FrameFiles, demand_writable
 from ..footage.border import find_outline, masked_border

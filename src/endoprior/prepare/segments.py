@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core.checks import input_error
-from ..data.files import of_type, read_json, read_parts
+from ..data.reading import of_type, read_json, read_parts
 from ..footage.components import runs
 from ..footage.disturbances import FrameQuality
 from .scan import Look, Scan

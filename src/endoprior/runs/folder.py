@@ -21,8 +21,7 @@ from ..core.config import Config
 from ..core.config_io import to_dict
 from ..core.shell import command
 from ..data import FrameSequence
-from ..data.files import read_json
-from ..data.reading import kind_of, load_yaml, read_text
+from ..data.reading import kind_of, load_yaml, read_json, read_text
 from ..model.hexplane import TOUCHED
 from ..model.method import config_from, method_of
 from ..model.windowed_scene import window_file

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from ..core.geometry import length_unit
-from ..data.known_length import MAX_MM
+from ..data.scale import MAX_MM
 from .incoming import are_numbers
 from .viewable import Layer, ViewSettings
 

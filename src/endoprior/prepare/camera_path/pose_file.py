@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from ...core.checks import input_error
 from ...data import nerfstudio
 from ...data.colmap import model_folder, read_colmap
-from ...data.files import in_order, portable, read_table
+from ...data.files import in_order, portable
 from ...data.frame_files import match_names
 from ...data.poses import demand_rotations
-from ...data.reading import read_numpy
+from ...data.reading import read_numpy, read_table
 
 HINT = "Write (T, 4, 4) camera-to-world matrices in mm, OpenCV axes."
 TEXT_SUFFIXES = (".txt", ".tum", ".freiburg", ".csv", ".kitti")
