@@ -129,6 +129,15 @@ def test_a_repeated_signal_does_not_end_the_cleanup():
             signal.raise_signal(signal.SIGINT)
 
 
+def test_a_signal_that_the_program_around_python_handles_stays_so(monkeypatch):
+    set_by_us = []
+    monkeypatch.setattr(signal, "getsignal", lambda _number: None)
+    monkeypatch.setattr(signal, "signal", lambda number, _handler: set_by_us.append(number))
+    with all_interrupt():
+        pass
+    assert set_by_us == []
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_a_signal_leaves_no_probe_of_a_folder(tmp_path, monkeypatch, name):
     touch = Path.touch

@@ -103,6 +103,19 @@ class FakeCluster:
         return Ended(key, error=answer) if isinstance(answer, Exception) else Ended(key, answer)
 
 
+def test_a_job_without_a_folder_does_not_stop_the_others(fake_steps, tmp_path, monkeypatch):
+    def opened(job):
+        if job.out.name == "a":
+            raise OSError("a name that is too long")
+
+    monkeypatch.setattr("endoprior.pipeline.batch.open_folder", opened)
+    (tmp_path / "a").write_text("")  # so that there is no place for the traceback either
+    entries = [entry(name, tmp_path) for name in "ab"]
+    assert [outcome.failure for outcome in run_here(entries, Shown())] == ["OSError: a name that is too long", ""]
+    cluster = FakeCluster({"b: before training": []})
+    assert [outcome.entry.name for outcome in run_on(cluster, entries, silent) if outcome.failure] == ["a"]
+
+
 def test_windows_of_all_jobs_train_at_the_same_time(fake_steps, tmp_path):
     windows = [Training(f"w{k}", tmp_path, tiny_config("basis"), tmp_path, False, Threads(1, 1)) for k in (1, 2)]
     answers = {"a: before training": windows, "b: before training": windows[:1], "c: before training": InputError("c")}

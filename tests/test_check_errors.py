@@ -10,7 +10,7 @@ from sequence_edits import change_poses, describe, edit
 from tiny_training import tiny_config
 
 from endoprior.check import find, measure
-from endoprior.check.errors import find_errors
+from endoprior.check.findings import find_errors
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom

@@ -34,6 +34,33 @@ def test_a_limit_of_the_process_counts():
 
 
 @pytest.mark.parametrize(
+    ("limit", "used", "parts", "name"),
+    [
+        ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
+    ],
+)
+def test_cached_files_of_a_container_count_as_free(tmp_path, monkeypatch, limit, used, parts, name):
+    monkeypatch.setattr(memory, "CONTROL_GROUP", tmp_path)
+    (tmp_path / "memory").mkdir()
+    for file, text in ((limit, "90000000"), (used, "89000000"), (parts, f"anon 1000\n{name} 50000000")):
+        (tmp_path / file).write_text(text + "\n")
+    assert available_bytes() == 51_000_000
+    (tmp_path / limit).write_text("max\n")  # no limit
+    assert available_bytes() > 51_000_000
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a system that binds processes to cores")
+def test_there_are_no_more_threads_than_cores_that_this_process_may_use():
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        assert memory.workers(1) == 1
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+@pytest.mark.parametrize(
     ("value", "wanted"), [("2", 2_000_000_000), ("0", 0), ("-1", 0), ("lots", None), ("nan", None), ("inf", None)]
 )
 def test_the_size_of_caches_can_be_set(monkeypatch, value, wanted):

@@ -76,6 +76,7 @@ def test_the_longest_stretch_with_a_pose_is_used():
     assert usable_frames(100, [33, 60], []) == (0, 100), "single frames are blurred, the camera is not lost"
     assert usable_frames(100, list(range(40, 100)), []) == (0, 40)
     assert usable_frames(100, list(range(40, 100)), [30]) == (0, 30)
+    assert usable_frames(100, [], [100, 1000, -150]) == (0, 100), "of another file: there are no such frames"
     assert usable_frames(100, list(range(7, 20)), []) == (20, 100), "the first loss comes early"
     assert usable_frames(100, [0, 1, 99], [60]) == (2, 60)
     assert usable_frames(100, list(range(7, 100)), []) == (0, 100), "too few frames would be left"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import errno
 import io
 import sys
 import time
@@ -11,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from tiny_training import tiny_config
 
+from endoprior.cli.progress import Counting
 from endoprior.data import load_sequence
 from endoprior.runs.progress import training_progress
 from endoprior.runs.train import train
@@ -23,6 +25,20 @@ class Terminal(io.StringIO):
     def isatty(self) -> bool:
         """It is one."""
         return True
+
+
+class ClosedTerminal(Terminal):
+    """Takes nothing any more."""
+
+    def write(self, text: str) -> int:
+        """Fail as a terminal that was closed."""
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def test_a_closed_terminal_does_not_end_the_work(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", ClosedTerminal())
+    with Counting() as progress:
+        progress("frames", 1, 2)
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 from endoprior.cli.arguments import Command, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
+from endoprior.system.devices import num_cores
 from endoprior.system.installation import page
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def run(argv: list[str]) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise input_error(args.out, "a place for a folder", f"{error.strerror}", "Choose another folder.") from None
-    at_once, reports = 1 if args.ray else max(1, (args.cores or _cores()) // args.threads), {}
+    at_once, reports = 1 if args.ray else max(1, (args.cores or num_cores()) // args.threads), {}
     with locked(args.out, args.out / ".lock"):
         if args.report_only:
             executor = nullcontext(None)
@@ -160,11 +160,6 @@ def _chosen(args: Bench, source: Path, folders: dict[str, Path]) -> dict[Path, S
         for name in sorted(names):
             open_sequence(loaded[path], name, args.out, write=False)
     return {path: spec for path, spec in loaded.items() if typed[path] or not (folders and spec.published)}
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def spec_page(name: str, source: Path) -> str:

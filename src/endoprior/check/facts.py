@@ -36,10 +36,9 @@ from ..footage.texts import resting_rectangles
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
 from ..system.parallel import Pool, frame_threads
-from .finding import About
+from .finding import About, about_sequence
 from .samples import (
     StereoFacts,
-    about_sequence,
     are_inverted,
     as_read,
     measure_polarity,
@@ -90,7 +89,7 @@ class MaskFacts:
 
     def tissue(self, frame: Frame) -> Mask:
         """(H, W) True on the tissue of a frame; inverted masks are corrected."""
-        return ~frame.tissue_mask if self.inverted else frame.tissue_mask
+        return true_tissue(frame, self.polarity)
 
 
 @dataclass(frozen=True)
@@ -196,7 +195,6 @@ def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool:
         pool.map,
     )
     masks = MaskFacts(tool_fraction, polarity, _confidence(sequence), tissue_like)
-    tissue = true_tissue(samples, polarity)
     step = -(-count // MOTION_FRAMES)
     followed = [sequence.frame(i) for i in range(0, count, step)]
     cameras = [sequence.camera(i) for i in range(count)]
@@ -221,8 +219,8 @@ def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool:
         changes=known.find_changes(lambda: (frame.rgb_u8 for frame in frames), pool.map),
         overexposed=np.array([_overexposed_share(frame) for frame in frames]),
         masks=masks,
-        border=_border(outline, images, tissue, masked),
-        depth=_depth(sequence, samples, tissue),
+        border=_border(outline, images, [masks.tissue(frame) for frame in samples], masked),
+        depth=_depth(sequence, samples, masks),
         stereo=measure_stereo(sequence),
         cloud=_first_points(sequence),
     )
@@ -290,8 +288,8 @@ def _mean(values: NDArray) -> float:
     return float(values.mean()) if values.size else 0.0
 
 
-def _depth(sequence: FrameSequence, samples: list[Frame], tissue: list[Mask]) -> DepthFacts:
-    """Coverage and median of every frame, and the distribution over the samples, of which this is the tissue."""
+def _depth(sequence: FrameSequence, samples: list[Frame], masks: MaskFacts) -> DepthFacts:
+    """Coverage and median of every frame, and the distribution over the tissue of the samples."""
     coverage, median, far = [], [], []
     for frame in sequence.frames("video"):
         on_tissue = frame.depth_valid & frame.tissue_mask
@@ -299,8 +297,7 @@ def _depth(sequence: FrameSequence, samples: list[Frame], tissue: list[Mask]) ->
         values = frame.depth[on_tissue]
         median.append(float(np.median(values[::EVERY])) if len(values) else float("nan"))
         far.append(_mean(values > FAR_MM))
-    pairs = list(zip(samples, tissue, strict=True))
-    values = np.concatenate([frame.depth[frame.depth_valid & mask][::EVERY] for frame, mask in pairs])
+    values = np.concatenate([frame.depth[frame.depth_valid & masks.tissue(frame)][::EVERY] for frame in samples])
     low, high = (float(v) for v in np.percentile(values, (1, 99))) if len(values) else (0.0, 0.0)
     margin = 0.1 * (high - low) or 0.1 * high or 1.0
     counts, edges = np.histogram(values, BINS, (max(low - margin, 0), high + margin))
@@ -320,7 +317,7 @@ def _depth(sequence: FrameSequence, samples: list[Frame], tissue: list[Mask]) ->
         counts,
         step=float(np.median(usual)) if usual else 0.0,
         bits=header[24] if len(header) == 26 else None,
-        unit=measure_unit(samples, tissue),
+        unit=measure_unit(samples, masks.polarity),
         relative=sequence.depth_is_relative,
         known=sequence.scale,
     )

@@ -10,7 +10,8 @@ from typing import Any, Literal
 from ..core.checks import number_ranges, read_ranges
 from ..core.config import DataConfig
 from ..core.shell import command
-from ..data.description import PrepareRecord
+from ..data import FrameSequence
+from ..data.description import PrepareRecord, read_description, read_record
 
 Severity = Literal["error", "warning", "note"]
 MIN_TRAINING_FRAMES = 2  # Training needs as many
@@ -31,6 +32,12 @@ class About:
     def depth_scale(self) -> float:
         """Mm per stored unit of depth: the option, else the value in `sequence.json`, else 1."""
         return float(self.data.depth_unit_mm or self.described.get("depth_scale") or 1.0)
+
+
+def about_sequence(sequence: FrameSequence, cfg: DataConfig) -> About:
+    """What is known of a sequence that was opened with these options, without its frames."""
+    described, record = read_description(sequence.path / "sequence.json"), read_record(sequence.path)
+    return About(sequence.path, len(sequence), described, dict(sequence.sources), cfg, record)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Problems of a sequence, each with its fix. Pure functions: facts in, findings out.
 
-The codes are stable; docs/check.md explains each.
+`find` looks for all of them. `find_errors`, for trainings, measures only what the worst ones need: a few frames, and
+small copies of the others, in about 2 % of the time of a training. The codes are stable; docs/check.md explains each.
 """
 
 from __future__ import annotations
@@ -13,15 +14,29 @@ from ..core.checks import quotation
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
 from ..core.shell import command
+from ..data import FrameSequence
 from ..data.description import MOTION, SIZE_NOT_STATED
 from ..data.image_folders import ways_to_prepare
 from ..footage.camera_motion import MOVING_FRACTION
-from ..footage.depth_unit import FAR_MM
+from ..footage.changes import find_cuts
+from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.disturbances import DARK_MEAN_GRAY
+from ..footage.mask_polarity import Polarity
+from ..footage.pose_fit import PoseFit
+from ..footage.stereo_order import StereoOrder
 from ..model.presets import preset
-from .errors import scene_cuts, swapped_eyes, swapped_masks, wrong_poses, wrong_unit
-from .facts import Facts
-from .finding import Finding, frame_list, longest_part, set_values, skip
+from ..system.parallel import frame_threads
+from .facts import BYTES_PER_PX, Facts
+from .finding import About, Finding, about_sequence, convert_poses, frame_list, longest_part, set_values, skip
+from .samples import (
+    are_inverted,
+    as_read,
+    measure_polarity,
+    measure_pose_fit,
+    measure_unit,
+    order_of_eyes,
+    sample_frames,
+)
 
 TOOL_MOST = 0.6  # With a larger share of tool pixels there is too little tissue for training
 COVERED = 0.5  # Depth on a smaller share of the tissue is sparse
@@ -47,6 +62,25 @@ def find(facts: Facts) -> list[Finding]:
     checks = (_masks, _depth, _border, _stereo, _motion, _poses, _windows, _changes, _video, _intrinsics, _rest)
     order = ("error", "warning", "note")
     return sorted((found for check in checks for found in check(facts)), key=lambda found: order.index(found.severity))
+
+
+def find_errors(sequence: FrameSequence) -> list[Finding]:
+    """The errors that a training would not notice, and learn something wrong. What ends it says so by itself."""
+    about, camera = about_sequence(sequence, sequence.reading or DataConfig()), sequence.camera(0)
+    video = sequence.frames("video")
+    with frame_threads(BYTES_PER_PX * camera.width * camera.height) as pool:
+        cuts = find_cuts((frame.rgb_u8 for frame in video), pool.map)
+        samples = sample_frames(sequence)
+        polarity = measure_polarity(samples)
+        unit = measure_unit(samples, polarity)
+        fit, order = measure_pose_fit(sequence, pool.map), order_of_eyes(sequence)
+    return [
+        *_swapped_masks(about, polarity),
+        *_wrong_unit(about, unit, is_guess=sequence.depth_is_guessed),
+        *(_wrong_poses(about, fit) if fit else ()),
+        *_scene_cuts(about, cuts),
+        *(_swapped_eyes(about, order) if order else ()),
+    ]
 
 
 def _intrinsics(facts: Facts) -> Iterator[Finding]:
@@ -87,7 +121,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         what = f"the program that found the tools is unsure in {frame_list(unsure)}"
         fix = f"look at them and correct them: `{command('view', facts.path)}`"
         yield Finding("uncertain-masks", "warning", what, fix, unsure)
-    yield from swapped_masks(facts, masks.polarity)
+    yield from _swapped_masks(facts, masks.polarity)
     if masks.inverted:
         return
     if mean > TOOL_MOST:
@@ -144,7 +178,7 @@ def _depth(facts: Facts) -> Iterator[Finding]:
         what = f"the median depth jumps at {frame_list(jumps)}"
         fix = f"bring the depth of all frames to one scale{or_again}"
         yield Finding("depth-jumps", "warning", what, fix, jumps)
-    yield from wrong_unit(facts, unit, is_guess=depth.relative or depth.known is not None)
+    yield from _wrong_unit(facts, unit, is_guess=depth.relative or depth.known is not None)
 
 
 def _border(facts: Facts) -> Iterator[Finding]:
@@ -188,7 +222,7 @@ def _poses(facts: Facts) -> Iterator[Finding]:
     fit = facts.pose_fit
     if fit is None:
         return
-    yield from wrong_poses(facts, fit)
+    yield from _wrong_poses(facts, fit)
     if fit.none_fits:
         what = f"the camera poses do not explain the images in any convention: depth reprojects to {fit.reason}"
         fix = f"match each pose to its frame, or `{command('poses', facts.path, '--poses', 'estimate')}`"
@@ -225,7 +259,7 @@ def _changes(facts: Facts) -> Iterator[Finding]:
     if jumps := changes.exposure_jumps:
         what = f"the brightness of the whole image jumps at {frame_list(jumps)}"
         yield Finding("exposure-jump", "warning", what, longest_part(facts, jumps), jumps)
-    yield from scene_cuts(facts, changes.cuts)
+    yield from _scene_cuts(facts, changes.cuts)
     # Frames that `prepare` marked count from the first one of the folder.
     whole = facts.data == DataConfig(shrink=facts.data.shrink)
     marked = facts.described.get("unexplained_frames", []) if whole else []
@@ -264,7 +298,7 @@ def _stereo(facts: Facts) -> Iterator[Finding]:
     stereo = facts.stereo
     if stereo is None:
         return
-    yield from swapped_eyes(facts, stereo.order)
+    yield from _swapped_eyes(facts, stereo.order)
     if stereo.vertical_px > VERTICAL_PX:
         what = f"the rows of left and right images are {stereo.vertical_px:.1f} px apart"
         moved = facts.record and "--row-offset" in facts.record.options
@@ -316,3 +350,52 @@ def _rescale_camera(facts: Facts, factor: float) -> str:
         size = "x".join(str(round(side * factor)) for side in record.source_size)
         fix += f"; or run `prepare` with `--calibration-size {size}`, if the calibration was made at this size"
     return fix
+
+
+def _swapped_masks(about: About, polarity: Polarity) -> Iterator[Finding]:
+    """Tissue is read as tool."""
+    if are_inverted(polarity):
+        what = f"tissue and tool are swapped in the masks ({as_read(polarity)})"
+        value = 0 if about.described.get("mask_tool_value", 255) == 255 else 255
+        yield Finding("mask-polarity", "error", what, set_values(about, mask_tool_value=value))
+
+
+def _wrong_unit(about: About, unit: UnitGuess, *, is_guess: bool) -> Iterator[Finding]:
+    """Depth is not in mm. Args: is_guess: its scale is unknown, or was found in another way: any distance is right."""
+    if unit.unit == "disparity":
+        fix = "store depth in mm: focal length (px) x baseline (mm) / disparity (px)"
+        fix += ", or run `prepare` with `--depth-relative disparity` for relative depth"
+        yield Finding("depth-disparity", "error", unit.reason, fix)
+    elif is_guess or unit.unit in ("mm", "none"):
+        return
+    elif unit.mm_per_unit is None:
+        fix = f"{set_values(about, depth_scale='MM_PER_UNIT')}, so that the tissue is some 20 to 250 mm away"
+        yield Finding("depth-unit", "error", unit.reason, fix)
+    else:
+        code = {"m": "depth-metres", "cm": "depth-centimetres"}.get(unit.unit, "depth-unit")
+        what = f"depth looks like {unit.unit}, not mm ({unit.reason})"
+        scale = f"{about.depth_scale * unit.mm_per_unit:.6g}"
+        fix = f"{set_values(about, depth_scale=scale)}, or train with `--data.depth-unit-mm {scale}`"
+        yield Finding(code, "error", what, fix)
+
+
+def _wrong_poses(about: About, fit: PoseFit) -> Iterator[Finding]:
+    """Camera poses have another convention."""
+    if fit.another_fits:
+        what = f"the camera poses explain the images better in another convention: depth reprojects to {fit.reason}"
+        yield Finding("poses-convention", "error", what, convert_poses(about, fit.best, fit.unit))
+
+
+def _scene_cuts(about: About, cuts: tuple[int, ...]) -> Iterator[Finding]:
+    """The clip shows several views. Args: cuts: the first frames of all but the first."""
+    if cuts:
+        what = f"the view changes abruptly at {frame_list(cuts)}"
+        yield Finding("scene-cut", "error", what, longest_part(about, cuts), cuts)
+
+
+def _swapped_eyes(about: About, order: StereoOrder) -> Iterator[Finding]:
+    """The left images are those of the right camera."""
+    if order.swapped:
+        fix = "run `prepare` with `--swap-eyes`, or without it where it was given; "
+        fix += f"by hand: swap the folders {about.path}/images and {about.path}/right, and measure depth again"
+        yield Finding("swapped-eyes", "error", f"left and right images are swapped ({order.reason})", fix)

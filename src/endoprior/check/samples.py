@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.config import DataConfig
+from ..core.geometry import camera_to_world
 from ..core.ranges import evenly_spaced
 from ..core.types import Frame
 from ..data import FrameSequence
-from ..data.description import read_description, read_record
 from ..data.files import in_order
 from ..data.images import read_color
 from ..footage.components import Image, InOrder, Mask
@@ -18,7 +17,6 @@ from ..footage.depth_unit import UnitGuess, guess_unit
 from ..footage.mask_polarity import Polarity, mask_polarity
 from ..footage.pose_fit import PoseFit, RgbdFrame, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
-from .finding import About
 
 SAMPLES = 20  # frames for measurements that are expensive
 CERTAIN = 0.5  # least certainty to report masks as inverted
@@ -37,12 +35,6 @@ class StereoFacts:
         """The measurements in one line."""
         rows = f"rows {self.vertical_px:.1f} px apart" if np.isfinite(self.vertical_px) else "too few matches"
         return f"{self.order.reason}; {rows}"
-
-
-def about_sequence(sequence: FrameSequence, cfg: DataConfig) -> About:
-    """What is known of a sequence that was opened with these options, without its frames."""
-    described, record = read_description(sequence.path / "sequence.json"), read_record(sequence.path)
-    return About(sequence.path, len(sequence), described, dict(sequence.sources), cfg, record)
 
 
 def sample_frames(sequence: FrameSequence) -> list[Frame]:
@@ -65,16 +57,14 @@ def as_read(polarity: Polarity) -> str:
     return polarity.reason.replace("high values cover", "pixels read as tool cover")
 
 
-def true_tissue(samples: list[Frame], polarity: Polarity) -> list[Mask]:
-    """(H, W) each, True on tissue; inverted masks are corrected."""
-    inverted = are_inverted(polarity)
-    return [~frame.tissue_mask if inverted else frame.tissue_mask for frame in samples]
+def true_tissue(frame: Frame, polarity: Polarity) -> Mask:
+    """(H, W) True on the tissue of a frame; inverted masks are corrected."""
+    return ~frame.tissue_mask if are_inverted(polarity) else frame.tissue_mask
 
 
-def measure_unit(samples: list[Frame], tissue: list[Mask]) -> UnitGuess:
-    """The unit of depth as read, on this tissue of the samples."""
-    pairs = zip(samples, tissue, strict=True)
-    return guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in pairs)
+def measure_unit(samples: list[Frame], polarity: Polarity) -> UnitGuess:
+    """The unit of depth as read, on the tissue of the samples, whose masks have this polarity."""
+    return guess_unit((each.depth, each.depth_valid, each.rgb_u8, true_tissue(each, polarity)) for each in samples)
 
 
 def measure_pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
@@ -86,8 +76,7 @@ def measure_pose_fit(sequence: FrameSequence, each: InOrder) -> PoseFit | None:
         return frame.rgb_u8, frame.tissue_mask, np.where(frame.depth_valid, frame.depth, np.float32(0))
 
     matrix = np.array([[first.fx, 0, first.cx - 0.5], [0, first.fy, first.cy - 0.5], [0, 0, 1]])
-    stored = np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))])
-    poses = np.linalg.inv(stored).astype(np.float64)
+    poses = camera_to_world(sequence.camera(i) for i in range(len(sequence)))
     return measure_poses(view, matrix, poses, relative=sequence.depth_is_guessed, each=each)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -11,6 +10,7 @@ from ..core.checks import InputError
 from ..core.config import Backend
 from ..core.shell import install_command, packages_of
 from ..system.console import say
+from ..system.devices import num_cores
 from ..system.installation import docs_folder, page, source_commit
 from ..system.memory import available_bytes
 from ..system.plugins import OWN_PACKAGE, installed
@@ -48,15 +48,14 @@ class Doctor(Command):
         )
         free = available_bytes()
         memory = "unknown memory" if free is None else f"{free / 1e9:.1f} GB free"
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        _row("computer", f"{platform.platform(terse=True)}, {platform.machine()}, {cores} cores, {memory}")
+        _row("computer", f"{platform.platform(terse=True)}, {platform.machine()}, {num_cores()} cores, {memory}")
         _row("Python", platform.python_version())
         for name in NEEDED:
             _row(name, _version(name) or "not installed")
         for part, purpose in OPTIONAL.items():
             versions = {name: _version(name) for name in packages_of(part)}
             there = ", ".join(f"{name} {found}" for name, found in versions.items())
-            _row(part, f"{purpose}: {there if all(versions.values()) else install_command(part)}")
+            _row(part, f"{purpose}: {there if versions and all(versions.values()) else install_command(part)}")
         say("")
         works = {"numba": _try("numba")}
         if self.compile:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Self
 
 from ..core.checks import printable
@@ -55,7 +55,8 @@ class Counting:
     def _replace_line(self, line: str) -> None:
         """Overwrite the line of a terminal, without escape codes: older consoles of Windows print them."""
         line = printable(line)
-        print(f"\r{line:<{self._width}}", end="\r", file=sys.stderr, flush=True)
+        with suppress(OSError):  # the terminal was closed, and the work goes on
+            print(f"\r{line:<{self._width}}", end="\r", file=sys.stderr, flush=True)
         self._width = len(line)
 
 

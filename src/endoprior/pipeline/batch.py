@@ -120,7 +120,7 @@ def _opened(entry: Entry) -> Outcome | None:
     """How a job ended that cannot begin, or is done."""
     try:
         _open(entry)
-    except InputError as error:
+    except Exception as error:
         return Outcome(entry, _reason(entry, error))
     return Outcome(entry) if entry.is_done else None
 
@@ -160,13 +160,16 @@ def _open(entry: Entry) -> None:
 
 
 def _reason(entry: Entry, error: Exception) -> str:
-    """One line; the traceback of an error of the program is written to the folder of the job."""
+    """One line; the traceback of an error of the program is written to the folder of the job, if that can be."""
     line = " ".join(str(error).split())
     if isinstance(error, InputError):
         return line
-    file = entry.job.out / FAILURE
-    write_text(file, "".join(traceback.format_exception(error)))
-    return f"{type(error).__name__}: {line[:200]} ({file})"
+    file, reason = entry.job.out / FAILURE, f"{type(error).__name__}: {line[:200]}"
+    try:
+        write_text(file, "".join(traceback.format_exception(error)))
+    except (InputError, OSError):
+        return reason
+    return f"{reason} ({file})"
 
 
 def write_summary(outcomes: Sequence[Outcome], out: Path) -> list[str]:

@@ -336,12 +336,12 @@ def usable_frames(num_frames: int, unexplained: list[int], cuts: list[int]) -> t
 
     Args:
         unexplained: frames without a camera pose, or of another color than the clip.
-        cuts: first frames after a scene cut.
+        cuts: first frames after a scene cut, from a file that may come from somebody else.
     """
     missing = np.zeros(num_frames, bool)
     missing[unexplained] = True
     ends = np.zeros(num_frames + 1, bool)
-    ends[[0, *cuts, num_frames]] = True
+    ends[[0, *(cut for cut in cuts if 0 < cut < num_frames), num_frames]] = True
     for first, end in runs(missing):
         if end - first >= LOST_FRAMES or first == 0 or end == num_frames:
             ends[first : end + 1] = True

@@ -12,7 +12,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
-from ..check.errors import find_errors
+from ..check.findings import find_errors
 from ..compute.parallel_kernels import start_threads
 from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from ..core.checks import input_error
+from .devices import num_cores
 
 CACHE_SHARE = 0.1
 MIN_CACHE, MAX_CACHE = 256 * 2**20, 512 * 2**20
@@ -28,6 +29,14 @@ KEPT = {M_MMAP_MAX: 0, M_TRIM_THRESHOLD: -1}
 """Nothing is mapped on its own, nothing goes back."""
 USUAL = {M_MMAP_MAX: 65_536, M_MMAP_THRESHOLD: 2**25, M_TRIM_THRESHOLD: 2**26}
 """What the library arrives at by itself in a process that frees large arrays."""
+
+CONTROL_GROUP = Path("/sys/fs/cgroup")
+"""Where Linux tells the limits of a container."""
+GROUP_FILES = (
+    ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
+)
+"""Of versions 2 and 1: the files with limit, use and its parts, and the part that Linux frees when it is needed."""
 
 Value = TypeVar("Value")
 
@@ -94,13 +103,12 @@ class BoundedCache(Generic[Value]):
 
 
 def _left_in_container() -> Iterator[int]:
-    folder = Path("/sys/fs/cgroup")
-    for limit, used in (
-        ("memory.max", "memory.current"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
-    ):
+    """Memory below the limit of a container, bytes. The system frees cached files when it needs memory: they count."""
+    for limit, used, parts, cached in GROUP_FILES:
         with suppress(OSError, ValueError):  # no such group, or no limit
-            yield int((folder / limit).read_text("ascii")) - int((folder / used).read_text("ascii"))
+            left = int((CONTROL_GROUP / limit).read_text("ascii")) - int((CONTROL_GROUP / used).read_text("ascii"))
+            sizes = dict(line.split() for line in (CONTROL_GROUP / parts).read_text("ascii").splitlines())
+            yield left + int(sizes.get(cached, 0))
 
 
 def _left_of_limits() -> Iterator[int]:
@@ -120,7 +128,7 @@ def workers(bytes_each: int) -> int:
     """Number of parallel threads that need `bytes_each`: at most one per core, and a quarter of the free memory."""
     free = available_bytes()
     affordable = free // 4 // max(bytes_each, 1) if free is not None else 1
-    return max(1, min(os.cpu_count() or 1, affordable))
+    return max(1, min(num_cores(), affordable))
 
 
 @contextmanager

@@ -20,14 +20,15 @@ def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
     """Call `handler` on each of these signals; nothing changes outside the main thread, which alone may handle them.
 
     One that is ignored stays so: `nohup` does that to SIGHUP on purpose. But scripts start jobs in the background with
-    SIGINT ignored, and who sends it to such a job means it.
+    SIGINT ignored, and who sends it to such a job means it. One that the program around Python handles (R, Blender)
+    stays so, too: Python could not give it back.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in numbers}
-    heard = [number for number in numbers if number == signal.SIGINT or before[number] is not signal.SIG_IGN]
+    before = {number: found for number in numbers if (found := signal.getsignal(number)) is not None}
+    heard = [number for number in before if number == signal.SIGINT or before[number] is not signal.SIG_IGN]
     try:
         for number in heard:
             signal.signal(number, handler)
