@@ -10,6 +10,7 @@ import sys
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from pkgutil import resolve_name
 from urllib.parse import unquote
 
 import pytest
@@ -119,6 +120,15 @@ def test_there_is_something_to_check():
     """The patterns above match: a page that shows every kind."""
     assert ["train", "DATA", "RUN"] in commands(ROOT / "README.md") and "your-own-video" in anchors(ROOT / "README.md")
     assert sum(len(commands(page)) for page in PAGES) > 50 and {"test", "docs"} <= TARGETS
+
+
+def test_paper_map_names_functions_and_tests_that_exist():
+    table = (ROOT / "docs" / "paper_map.md").read_text(encoding="utf-8").partition("\n## ")[0]
+    for name in re.findall(r"`(\w+(?:\.\w+)+)`", table):
+        if name.endswith(".py"):
+            assert (ROOT / "tests" / name).is_file(), name
+        else:
+            assert resolve_name(f"endoprior.{name}"), name
 
 
 def test_page_of_check_names_every_problem():

@@ -24,7 +24,7 @@ from ..system.surroundings import reject_surroundings, set_up_process
 
 COMMANDS = {
     "run": ("run", "from a video to a model to look at: prepare, check, train, score, video, player"),
-    "demo": ("phantom", "phantom sequence -> train -> eval -> render, with a summary and pictures"),
+    "demo": ("phantom", "phantom sequence -> train -> eval -> render, with a summary and images"),
     "phantom": ("phantom", "write a synthetic surgical sequence with full ground truth"),
     "scan": ("scan", "look through a whole video: which segments can become a model, and why the rest not"),
     "sample": ("sample", "write a made-up stereo video with calibration, to try `run` and `prepare`"),

@@ -43,9 +43,9 @@ class Render(Command):
     camera_path: Path | None = None
     """JSON list of {"time", "world_to_camera"} to render instead of a split; it has times and cameras of its own."""
     highlights: bool = True
-    """`--no-highlights` shows the tissue below them, as other frames show it. Default: RUN/renders/no_highlights."""
+    """Highlights; without them the tissue below, as other frames show it. Default OUT: RUN/renders/no_highlights."""
     smoke: bool = True
-    """`--no-smoke` leaves out the smoke that training found. Default: RUN/renders/no_smoke."""
+    """The smoke that training found. Default OUT: RUN/renders/no_smoke."""
     data: Path | None = None
     """Sequence folder with the input frames. Default: the one the run was trained on."""
     device: Wanted = "auto"

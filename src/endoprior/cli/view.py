@@ -33,7 +33,7 @@ class View(Command):
     data: Path | None = None
     """Sequence folder with the input frames of a run. Default: the one it was trained on."""
     highlights: bool = True
-    """`--no-highlights` shows the tissue below the highlights of a run, as other frames show it."""
+    """Highlights of a run; without them, the tissue below, as other frames show it."""
     host: str = "127.0.0.1"
     """Address to listen on. Other machines reach any but 127.0.0.1, without encryption."""
     port: int = 8080

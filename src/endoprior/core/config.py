@@ -53,8 +53,8 @@ class DataConfig(Checked):
     """`used`: frames without a camera pose are neither trained on nor scored, and blurred, hazy or saturated ones count
     less. `ignored`: all count alike, as published."""
     eyes: Literal["left", "both"] = "left"
-    """Eyes whose pictures are trained on, in turn at random; `both` needs the right ones (docs/scores.md). Each sees
-    its own highlights, and has half of the iterations: `endoprior train` takes twice as many unless told how many."""
+    """Cameras whose images are trained on, in turn at random; `both` needs the right images (docs/scores.md). Each
+    sees its own highlights and has half of the iterations: `endoprior train` doubles them unless you set them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -247,7 +247,7 @@ class Config(Checked):
     """The whole config. Equal configs, data and machine give bit-identical results on a CPU."""
 
     method: str = OWN
-    """Whose rules start, draw, compare and grow: ours, or those of another installed method (docs/methods.md)."""
+    """Method that starts, moves, compares and grows the Gaussians: ours, or another installed one (docs/methods.md)."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random choices. Sampling, initial weights, frame order and splits."""
     fit_to_clip: bool = False

@@ -90,7 +90,7 @@ class PrepareConfig:
     """Resize wider images to this width, px; 0 keeps the size."""
 
     depth: str = "auto"
-    """`sgbm` (stereo), `motion` (parallax of a moving camera), `shading` (one eye, relative), `depth-anything` (a
+    """`sgbm` (stereo), `motion` (parallax of a moving camera), `shading` (one camera, relative), `depth-anything` (a
     network), a folder of depth files, or `none`. `auto` is `sgbm` for two cameras; for one, `motion` where the camera
     moves enough, else `shading`. A colon may follow: after `motion` what fills it where nothing is measured, without it
     `shading`; after `depth-anything` the folder of its weights."""
