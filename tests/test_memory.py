@@ -46,6 +46,8 @@ def test_cached_files_of_a_container_count_as_free(tmp_path, monkeypatch, limit,
     for file, text in ((limit, "90000000"), (used, "89000000"), (parts, f"anon 1000\n{name} 50000000")):
         (tmp_path / file).write_text(text + "\n")
     assert available_bytes() == 51_000_000
+    (tmp_path / parts).write_text("not what is expected\n")  # the limit holds all the same
+    assert available_bytes() == 1_000_000
     (tmp_path / limit).write_text("max\n")  # no limit
     assert available_bytes() > 51_000_000
 

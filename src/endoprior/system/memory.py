@@ -107,8 +107,10 @@ def _left_in_container() -> Iterator[int]:
     for limit, used, parts, cached in GROUP_FILES:
         with suppress(OSError, ValueError):  # no such group, or no limit
             left = int((CONTROL_GROUP / limit).read_text("ascii")) - int((CONTROL_GROUP / used).read_text("ascii"))
-            sizes = dict(line.split() for line in (CONTROL_GROUP / parts).read_text("ascii").splitlines())
-            yield left + int(sizes.get(cached, 0))
+            with suppress(OSError, ValueError):  # the limit holds without its parts, too
+                sizes = dict(line.split() for line in (CONTROL_GROUP / parts).read_text("ascii").splitlines())
+                left += int(sizes.get(cached, 0))
+            yield left
 
 
 def _left_of_limits() -> Iterator[int]:
