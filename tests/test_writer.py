@@ -58,3 +58,13 @@ def test_unusable_places_and_arrays_are_named(tmp_path):
             pass
     with pytest.raises(ValueError, match="tool_mask"), new_sequence(tmp_path / "out", META) as writer:
         writer.add(image(), np.zeros((6, 4), bool))
+
+
+def test_arrays_are_stored_alone_by_any_version_of_numpy(tmp_path, monkeypatch):
+    """NumPy below 2.1 stores every keyword as an array: `allow_pickle` would be one."""
+    keywords = []
+    monkeypatch.setattr(np, "savez_compressed", lambda _file, **arrays: keywords.extend(arrays))
+    with new_sequence(tmp_path / "S", META) as writer:
+        writer.write_arrays("truth/tracks.npz", points=np.zeros(3))
+        writer.add(image(), np.zeros((4, 6), bool))
+    assert keywords == ["points"]

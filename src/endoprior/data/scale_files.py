@@ -101,4 +101,4 @@ def _scale_tracks(file: Path, target: Path, ratio: float) -> None:
         raise input_error(file, "an array points", "none of real numbers", fix)
     arrays["points"] = (points * ratio).astype(points.dtype)
     with whole_file(target) as temporary:
-        np.savez_compressed(temporary, allow_pickle=False, **arrays)
+        np.savez_compressed(temporary, **arrays)  # pyright: ignore[reportArgumentType]  # allow_pickle: NumPy >= 2.1

@@ -223,7 +223,7 @@ class FrameFiles:
 
     def write_arrays(self, name: str, **arrays: NDArray) -> None:
         """Write named arrays to `name` (relative, `.npz`)."""
-        np.savez_compressed(self._file(name), allow_pickle=False, **arrays)
+        np.savez_compressed(self._file(name), **arrays)  # pyright: ignore[reportArgumentType]  # allow_pickle: NumPy >= 2.1
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write `content` to `name` (relative, `.json`)."""
