@@ -153,54 +153,61 @@ def _local_per_px(xx, xy, yy, det, b0, b1, c0, c1):
     )  # fmt: skip
 
 
-@parallel_njit(error_model="numpy")
-def project_forward(
-    means, quats, scales, opacities, sh, color_slopes, view, center, lens, width, height,
+@njit(error_model="numpy")
+def _project_block(
+    block, means, quats, scales, opacities, sh, color_slopes, view, center, lens, width, height,
     means2d, conic_ldl, z_out, colors, color_slopes2d, radii,
 ):  # fmt: skip
-    # One task per BLOCK Gaussians. Writes one row of each output; culled: all zeros.
+    # Writes one row of each output; culled: all zeros.
     num, num_sh = len(means), sh.shape[1]
-    for block in prange((num + BLOCK - 1) // BLOCK):
-        axes, turn, values = np.empty((3, 3)), np.empty((3, 3)), np.empty(16, f4)
-        for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
-            means2d[g] = conic_ldl[g] = colors[g] = f4(0)
-            color_slopes2d[g] = f4(0)
-            z_out[g] = f4(0)
-            radii[g] = 0
-            wx, wy, wz, x, y, z = _center(view, means[g])
-            if not z > NEAR_Z:  # False for NaN
-                continue
-            _, _, _, _, length = _axes(view, quats[g], scales[g], turn, axes)
-            _, _, b0, b1, b2, c0, c1, c2 = _projected_axes(lens, x, y, z, axes)
-            xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
-            px, py = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+    axes, turn, values = np.empty((3, 3)), np.empty((3, 3)), np.empty(16, f4)
+    for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
+        means2d[g] = conic_ldl[g] = colors[g] = f4(0)
+        color_slopes2d[g] = f4(0)
+        z_out[g] = f4(0)
+        radii[g] = 0
+        wx, wy, wz, x, y, z = _center(view, means[g])
+        if not z > NEAR_Z:  # False for NaN
+            continue
+        _, _, _, _, length = _axes(view, quats[g], scales[g], turn, axes)
+        _, _, b0, b1, b2, c0, c1, c2 = _projected_axes(lens, x, y, z, axes)
+        xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
+        px, py = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
 
-            dx, dy, dz, _ = _direction(wx, wy, wz, center)
-            _write_basis(f4(dx), f4(dy), f4(dz), num_sh, values)
-            red, green, blue = _expansion(values, sh, g)
-            # One sum notices every NaN and infinity.
-            size = abs(px) + abs(py) + z + xx * yy + abs(red) + abs(green) + abs(blue) + abs(opacities[g])
-            for i in range(3):
-                size += abs(color_slopes[g, 0, i]) + abs(color_slopes[g, 1, i])  # a pixel adds at most 0.92 of it
-            if not (size < OVERFLOW and length >= MIN_QUAT):
-                continue
-            means2d[g, 0], means2d[g, 1], z_out[g] = px, py, z
-            conic_ldl[g, 0], conic_ldl[g, 1], conic_ldl[g, 2] = yy / det, -xy / yy, 1.0 / yy
-            colors[g, 0], colors[g, 1], colors[g, 2] = max(red, f4(0)), max(green, f4(0)), max(blue, f4(0))
-            x0, x1, y0, y1 = _local_per_px(xx, xy, yy, det, b0, b1, c0, c1)
-            for i in range(3):
-                color_slopes2d[g, 0, i] = x0 * color_slopes[g, 0, i] + x1 * color_slopes[g, 1, i]
-                color_slopes2d[g, 1, i] = y0 * color_slopes[g, 0, i] + y1 * color_slopes[g, 1, i]
-            if opacities[g] >= f4(ALPHA_MIN):
-                level = 2.0 * np.log(opacities[g] / ALPHA_MIN)  # squared reach of the footprint, in sigmas
-                reach_x, reach_y = np.sqrt(level * xx), np.sqrt(level * yy)
-                if (
-                    px + reach_x >= 0.5 and px - reach_x <= width - 0.5
-                    and py + reach_y >= 0.5 and py - reach_y <= height - 0.5
-                ):  # fmt: skip
-                    half = 0.5 * (xx - yy)
-                    long_axis = 0.5 * (xx + yy) + np.sqrt(half * half + xy * xy)
-                    radii[g] = np.int32(min(np.ceil(3.0 * np.sqrt(long_axis)), 2.0**30))
+        dx, dy, dz, _ = _direction(wx, wy, wz, center)
+        _write_basis(f4(dx), f4(dy), f4(dz), num_sh, values)
+        red, green, blue = _expansion(values, sh, g)
+        # One sum notices every NaN and infinity.
+        size = abs(px) + abs(py) + z + xx * yy + abs(red) + abs(green) + abs(blue) + abs(opacities[g])
+        for i in range(3):
+            size += abs(color_slopes[g, 0, i]) + abs(color_slopes[g, 1, i])  # a pixel adds at most 0.92 of it
+        if not (size < OVERFLOW and length >= MIN_QUAT):
+            continue
+        means2d[g, 0], means2d[g, 1], z_out[g] = px, py, z
+        conic_ldl[g, 0], conic_ldl[g, 1], conic_ldl[g, 2] = yy / det, -xy / yy, 1.0 / yy
+        colors[g, 0], colors[g, 1], colors[g, 2] = max(red, f4(0)), max(green, f4(0)), max(blue, f4(0))
+        x0, x1, y0, y1 = _local_per_px(xx, xy, yy, det, b0, b1, c0, c1)
+        for i in range(3):
+            color_slopes2d[g, 0, i] = x0 * color_slopes[g, 0, i] + x1 * color_slopes[g, 1, i]
+            color_slopes2d[g, 1, i] = y0 * color_slopes[g, 0, i] + y1 * color_slopes[g, 1, i]
+        if opacities[g] >= f4(ALPHA_MIN):
+            level = 2.0 * np.log(opacities[g] / ALPHA_MIN)  # squared reach of the footprint, in sigmas
+            reach_x, reach_y = np.sqrt(level * xx), np.sqrt(level * yy)
+            if (
+                px + reach_x >= 0.5 and px - reach_x <= width - 0.5
+                and py + reach_y >= 0.5 and py - reach_y <= height - 0.5
+            ):  # fmt: skip
+                half = 0.5 * (xx - yy)
+                long_axis = 0.5 * (xx + yy) + np.sqrt(half * half + xy * xy)
+                radii[g] = np.int32(min(np.ceil(3.0 * np.sqrt(long_axis)), 2.0**30))
+
+
+@parallel_njit(error_model="numpy")
+def project_forward(means, *others):
+    # One task per BLOCK Gaussians. Takes what `_project_block` does, which is apart because Numba infers the types of a
+    # parallel loop's body twice; np.int64, because the second time the index is unsigned.
+    for block in prange((len(means) + BLOCK - 1) // BLOCK):
+        _project_block(np.int64(block), means, *others)
 
 
 @njit(inline="always")
@@ -236,84 +243,90 @@ def _pull_turn(r, w, x, y, z):
     return v_w, v_x - 4 * x * (r[1, 1] + r[2, 2]), v_y - 4 * y * (r[0, 0] + r[2, 2]), v_z - 4 * z * (r[0, 0] + r[1, 1])
 
 
-@parallel_njit(error_model="numpy")
-def project_backward(
-    means, quats, scales, sh, color_slopes, view, center, lens, radii,
+@njit(error_model="numpy")
+def _pull_block(
+    block, means, quats, scales, sh, color_slopes, view, center, lens, radii,
     v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d, v_means, v_quats, v_scales, v_sh, v_color_slopes,
 ):  # fmt: skip
-    # One task per BLOCK Gaussians. Writes one row of each of the last five; zeros where radii is 0.
+    # Writes one row of each of the last five; zeros where radii is 0.
     num, num_sh = len(means), sh.shape[1]
-    for block in prange((num + BLOCK - 1) // BLOCK):
-        axes, turn, v_axes, v_turn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        values, v_values = np.empty(16, f4), np.empty(16, f4)
-        for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
-            if radii[g] == 0:
-                v_means[g] = v_quats[g] = v_scales[g] = f4(0)
-                v_sh[g] = v_color_slopes[g] = f4(0)
-                continue
-            wx, wy, wz, x, y, z = _center(view, means[g])
-            qw, qx, qy, qz, length = _axes(view, quats[g], scales[g], turn, axes)
-            slope_x, slope_y, b0, b1, b2, c0, c1, c2 = _projected_axes(lens, x, y, z, axes)
-            xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
+    axes, turn, v_axes, v_turn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    values, v_values = np.empty(16, f4), np.empty(16, f4)
+    for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
+        if radii[g] == 0:
+            v_means[g] = v_quats[g] = v_scales[g] = f4(0)
+            v_sh[g] = v_color_slopes[g] = f4(0)
+            continue
+        wx, wy, wz, x, y, z = _center(view, means[g])
+        qw, qx, qy, qz, length = _axes(view, quats[g], scales[g], turn, axes)
+        slope_x, slope_y, b0, b1, b2, c0, c1, c2 = _projected_axes(lens, x, y, z, axes)
+        xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
 
-            # LDL^T factors -> covariance -> rows of J times the axes.
-            v_a, v_k = np.float64(v_conic_ldl[g, 0]), np.float64(v_conic_ldl[g, 1])
-            v_det = -v_a * yy / (det * det)
-            v_xx = v_det * yy
-            v_xy = -2.0 * v_det * xy - v_k / yy
-            v_yy = -v_a * (xy / det) ** 2 + (v_k * xy - v_conic_ldl[g, 2]) / (yy * yy)
+        # LDL^T factors -> covariance -> rows of J times the axes.
+        v_a, v_k = np.float64(v_conic_ldl[g, 0]), np.float64(v_conic_ldl[g, 1])
+        v_det = -v_a * yy / (det * det)
+        v_xx = v_det * yy
+        v_xy = -2.0 * v_det * xy - v_k / yy
+        v_yy = -v_a * (xy / det) ** 2 + (v_k * xy - v_conic_ldl[g, 2]) / (yy * yy)
 
-            # Slopes of the color, P^T times color_slopes with P = inverse covariance times b, c of two axes.
-            x0, x1, y0, y1 = _local_per_px(xx, xy, yy, det, b0, b1, c0, c1)
-            v_x0 = v_x1 = v_y0 = v_y1 = 0.0
-            for i in range(3):
-                along_x, along_y = np.float64(v_color_slopes2d[g, 0, i]), np.float64(v_color_slopes2d[g, 1, i])
-                v_color_slopes[g, 0, i] = x0 * along_x + y0 * along_y
-                v_color_slopes[g, 1, i] = x1 * along_x + y1 * along_y
-                v_x0, v_x1 = v_x0 + along_x * color_slopes[g, 0, i], v_x1 + along_x * color_slopes[g, 1, i]
-                v_y0, v_y1 = v_y0 + along_y * color_slopes[g, 0, i], v_y1 + along_y * color_slopes[g, 1, i]
-            t_b0, t_c0 = (yy * v_x0 - xy * v_y0) / det, (xx * v_y0 - xy * v_x0) / det
-            t_b1, t_c1 = (yy * v_x1 - xy * v_y1) / det, (xx * v_y1 - xy * v_x1) / det
-            v_xx -= t_b0 * x0 + t_b1 * x1
-            v_yy -= t_c0 * y0 + t_c1 * y1
-            v_xy -= t_b0 * y0 + t_b1 * y1 + t_c0 * x0 + t_c1 * x1
+        # Slopes of the color, P^T times color_slopes with P = inverse covariance times b, c of two axes.
+        x0, x1, y0, y1 = _local_per_px(xx, xy, yy, det, b0, b1, c0, c1)
+        v_x0 = v_x1 = v_y0 = v_y1 = 0.0
+        for i in range(3):
+            along_x, along_y = np.float64(v_color_slopes2d[g, 0, i]), np.float64(v_color_slopes2d[g, 1, i])
+            v_color_slopes[g, 0, i] = x0 * along_x + y0 * along_y
+            v_color_slopes[g, 1, i] = x1 * along_x + y1 * along_y
+            v_x0, v_x1 = v_x0 + along_x * color_slopes[g, 0, i], v_x1 + along_x * color_slopes[g, 1, i]
+            v_y0, v_y1 = v_y0 + along_y * color_slopes[g, 0, i], v_y1 + along_y * color_slopes[g, 1, i]
+        t_b0, t_c0 = (yy * v_x0 - xy * v_y0) / det, (xx * v_y0 - xy * v_x0) / det
+        t_b1, t_c1 = (yy * v_x1 - xy * v_y1) / det, (xx * v_y1 - xy * v_x1) / det
+        v_xx -= t_b0 * x0 + t_b1 * x1
+        v_yy -= t_c0 * y0 + t_c1 * y1
+        v_xy -= t_b0 * y0 + t_b1 * y1 + t_c0 * x0 + t_c1 * x1
 
-            vb0, vb1, vb2 = 2 * v_xx * b0 + v_xy * c0, 2 * v_xx * b1 + v_xy * c1, 2 * v_xx * b2 + v_xy * c2
-            vc0, vc1, vc2 = 2 * v_yy * c0 + v_xy * b0, 2 * v_yy * c1 + v_xy * b1, 2 * v_yy * c2 + v_xy * b2
-            vb0, vb1, vc0, vc1 = vb0 + t_b0, vb1 + t_b1, vc0 + t_c0, vc1 + t_c1
+        vb0, vb1, vb2 = 2 * v_xx * b0 + v_xy * c0, 2 * v_xx * b1 + v_xy * c1, 2 * v_xx * b2 + v_xy * c2
+        vc0, vc1, vc2 = 2 * v_yy * c0 + v_xy * b0, 2 * v_yy * c1 + v_xy * b1, 2 * v_yy * c2 + v_xy * b2
+        vb0, vb1, vc0, vc1 = vb0 + t_b0, vb1 + t_b1, vc0 + t_c0, vc1 + t_c1
 
-            # Rows of J -> axes, slopes and depth.
-            gx, gy = lens[0] / z, lens[1] / z
-            v_axes[0, 0], v_axes[0, 1], v_axes[0, 2] = gx * vb0, gx * vb1, gx * vb2
-            v_axes[1, 0], v_axes[1, 1], v_axes[1, 2] = gy * vc0, gy * vc1, gy * vc2
-            for j in range(3):
-                v_axes[2, j] = -slope_x * v_axes[0, j] - slope_y * v_axes[1, j]
-            v_x = v_means2d[g, 0] * gx
-            v_y = v_means2d[g, 1] * gy
-            v_depth = v_z[g] - (v_x * x + v_y * y) / z
-            v_depth -= (vb0 * b0 + vb1 * b1 + vb2 * b2 + vc0 * c0 + vc1 * c1 + vc2 * c2) / z
-            if lens[4] <= x / z <= lens[5]:
-                v_slope = -(v_axes[0, 0] * axes[2, 0] + v_axes[0, 1] * axes[2, 1] + v_axes[0, 2] * axes[2, 2])
-                v_x += v_slope / z
-                v_depth -= v_slope * x / (z * z)
-            if lens[6] <= y / z <= lens[7]:
-                v_slope = -(v_axes[1, 0] * axes[2, 0] + v_axes[1, 1] * axes[2, 1] + v_axes[1, 2] * axes[2, 2])
-                v_y += v_slope / z
-                v_depth -= v_slope * y / (z * z)
+        # Rows of J -> axes, slopes and depth.
+        gx, gy = lens[0] / z, lens[1] / z
+        v_axes[0, 0], v_axes[0, 1], v_axes[0, 2] = gx * vb0, gx * vb1, gx * vb2
+        v_axes[1, 0], v_axes[1, 1], v_axes[1, 2] = gy * vc0, gy * vc1, gy * vc2
+        for j in range(3):
+            v_axes[2, j] = -slope_x * v_axes[0, j] - slope_y * v_axes[1, j]
+        v_x = v_means2d[g, 0] * gx
+        v_y = v_means2d[g, 1] * gy
+        v_depth = v_z[g] - (v_x * x + v_y * y) / z
+        v_depth -= (vb0 * b0 + vb1 * b1 + vb2 * b2 + vc0 * c0 + vc1 * c1 + vc2 * c2) / z
+        if lens[4] <= x / z <= lens[5]:
+            v_slope = -(v_axes[0, 0] * axes[2, 0] + v_axes[0, 1] * axes[2, 1] + v_axes[0, 2] * axes[2, 2])
+            v_x += v_slope / z
+            v_depth -= v_slope * x / (z * z)
+        if lens[6] <= y / z <= lens[7]:
+            v_slope = -(v_axes[1, 0] * axes[2, 0] + v_axes[1, 1] * axes[2, 1] + v_axes[1, 2] * axes[2, 2])
+            v_y += v_slope / z
+            v_depth -= v_slope * y / (z * z)
 
-            # Color -> coefficients and direction of view -> mean.
-            dx, dy, dz, inverse = _direction(wx, wy, wz, center)
-            _write_basis(f4(dx), f4(dy), f4(dz), num_sh, values)
-            _pull_color(values, sh, v_colors, g, v_values, v_sh)
-            v_dx, v_dy, v_dz = _direction_gradient(f4(dx), f4(dy), f4(dz), num_sh, v_values)
-            along = v_dx * dx + v_dy * dy + v_dz * dz
-            v_means[g, 0] = view[0, 0] * v_x + view[1, 0] * v_y + view[2, 0] * v_depth + inverse * (v_dx - along * dx)
-            v_means[g, 1] = view[0, 1] * v_x + view[1, 1] * v_y + view[2, 1] * v_depth + inverse * (v_dy - along * dy)
-            v_means[g, 2] = view[0, 2] * v_x + view[1, 2] * v_y + view[2, 2] * v_depth + inverse * (v_dz - along * dz)
+        # Color -> coefficients and direction of view -> mean.
+        dx, dy, dz, inverse = _direction(wx, wy, wz, center)
+        _write_basis(f4(dx), f4(dy), f4(dz), num_sh, values)
+        _pull_color(values, sh, v_colors, g, v_values, v_sh)
+        v_dx, v_dy, v_dz = _direction_gradient(f4(dx), f4(dy), f4(dz), num_sh, v_values)
+        along = v_dx * dx + v_dy * dy + v_dz * dz
+        v_means[g, 0] = view[0, 0] * v_x + view[1, 0] * v_y + view[2, 0] * v_depth + inverse * (v_dx - along * dx)
+        v_means[g, 1] = view[0, 1] * v_x + view[1, 1] * v_y + view[2, 1] * v_depth + inverse * (v_dy - along * dy)
+        v_means[g, 2] = view[0, 2] * v_x + view[1, 2] * v_y + view[2, 2] * v_depth + inverse * (v_dz - along * dz)
 
-            # Axes = view R diag(scales) -> scales and R -> quaternion, through its normalization.
-            _pull_axes(view, v_axes, turn, scales[g], v_turn, v_scales[g])
-            v_w, v_qx, v_qy, v_qz = _pull_turn(v_turn, qw, qx, qy, qz)
-            along = v_w * qw + v_qx * qx + v_qy * qy + v_qz * qz
-            v_quats[g, 0], v_quats[g, 1] = (v_w - along * qw) / length, (v_qx - along * qx) / length
-            v_quats[g, 2], v_quats[g, 3] = (v_qy - along * qy) / length, (v_qz - along * qz) / length
+        # Axes = view R diag(scales) -> scales and R -> quaternion, through its normalization.
+        _pull_axes(view, v_axes, turn, scales[g], v_turn, v_scales[g])
+        v_w, v_qx, v_qy, v_qz = _pull_turn(v_turn, qw, qx, qy, qz)
+        along = v_w * qw + v_qx * qx + v_qy * qy + v_qz * qz
+        v_quats[g, 0], v_quats[g, 1] = (v_w - along * qw) / length, (v_qx - along * qx) / length
+        v_quats[g, 2], v_quats[g, 3] = (v_qy - along * qy) / length, (v_qz - along * qz) / length
+
+
+@parallel_njit(error_model="numpy")
+def project_backward(means, *others):
+    # One task per BLOCK Gaussians; takes what `_pull_block` does.
+    for block in prange((len(means) + BLOCK - 1) // BLOCK):
+        _pull_block(np.int64(block), means, *others)
