@@ -5,6 +5,7 @@ A score that cannot be computed is listed as skipped, with the reason. No other 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from ..compute.parallel_kernels import start_threads
 from ..core.checks import input_error
 from ..core.config import DataConfig
+from ..core.types import Fingerprints
 from ..data import FrameSequence, Split, check_sequence
 from ..model.scene import RenderedScene
 from ..system.devices import name_of
@@ -25,6 +27,14 @@ from .protocols.table import OURS
 from .registry import REGISTRY, SCORERS, scorers
 from .score import ScoreUnavailable
 from .scorers.model import FPS_RENDERS, LONGEST_SECONDS
+
+SAME_FILES = "these files"
+SAME_IMAGES = "these images; masks, depth, poses or descriptions were others"
+OTHER_IMAGES = "other images"
+"""What a scene was trained on, compared with what it is scored on: `trained_on` of the protocol."""
+SHOWN_DIGITS = 8  # of a fingerprint, in a warning
+
+log = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -57,8 +67,8 @@ def evaluate(
         protocols: also score as these papers did, into `Evaluation.protocols`.
     Raises:
         InputError: the sequence is not the one the scene was trained on: the number of frames differs, or their size,
-            except by `shrink`. Another sequence of this length and size is scored all the same: `data_fingerprint` in
-            `Evaluation.protocol` and `config.json` of the run tell them apart.
+            except by `shrink`. Other images of this number and size are scored all the same, with a warning; other
+            masks, depth or poses without one. `trained_on` in `Evaluation.protocol` says which it was.
         RuntimeError: this process is a fork of one that has rendered or trained.
 
     Example:
@@ -90,7 +100,10 @@ def evaluate(
     else:
         frames = scene
     reading = reading or DataConfig()
-    result = Evaluation(_protocol(sequence, split, reading) | rendering)
+    found = sequence.fingerprints()
+    result = Evaluation(_protocol(sequence, split, reading) | {"data_fingerprint": found.data} | rendering)
+    if isinstance(scene, RenderedScene) and scene.trained_on and scene.trained_on.images and found.images:
+        result.protocol["trained_on"] = _trained_on(scene.trained_on, found, sequence.path)
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
     context = EvaluationContext(
@@ -124,6 +137,22 @@ def _reject_other_size(scene: RenderedScene, sequence: FrameSequence) -> None:
         raise input_error(sequence.path, expected, f"{theirs.width}x{theirs.height}", "pass the same sequence.")
 
 
+def _trained_on(trained: Fingerprints, scored: Fingerprints, data: Path) -> str:
+    """What a scene was trained on, in words; a warning where that is another video than it is scored on.
+
+    Masks that were corrected, or depth that was added, belong to the same video.
+    """
+    if trained == scored:
+        return SAME_FILES
+    if trained.images == scored.images:
+        return SAME_IMAGES
+    ours, theirs = (each.images[:SHOWN_DIGITS] for each in (trained, scored))
+    expected, got = f"the images that the scene was trained on (SHA-256 {ours}...)", f"others ({theirs}...)"
+    fix = "`endoprior eval RUN --data FOLDER` with those images."
+    log.warning("warning: %s", input_error(data, expected, got, fix))
+    return OTHER_IMAGES
+
+
 def scored_data(trained: DataConfig) -> DataConfig:
     """How frames are read to score a scene: those it was trained on, with depth as it was measured."""
     return replace(trained, lift_missing_depth=False)
@@ -149,5 +178,4 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "right_*": "tissue that both eyes see by measured depth; right pictures as they are, left mask",
         "poses": "of the scene",
         "depth_instability_mm": "all adjacent frames of the video",
-        "data_fingerprint": sequence.fingerprint(),
     }

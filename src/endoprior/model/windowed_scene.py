@@ -11,7 +11,7 @@ import torch
 
 from .. import render
 from ..core.config import Config
-from ..core.types import Camera
+from ..core.types import Camera, Fingerprints
 from ..system.arrays_file import save_arrays
 from ..system.memory import BoundedCache
 from .scene import Scene, SingleScene, Window
@@ -48,6 +48,7 @@ class WindowedScene(Scene):
     device_name: str = "cpu"
     """Device that windows are moved to when they are read."""
     fp16_planes: bool = False
+    trained_on: Fingerprints | None = None
 
     def __len__(self) -> int:
         return sum(span.num_gaussians for span in self.spans)
