@@ -46,7 +46,7 @@ class RenderedScene(ABC):
         """This scene on a device; itself if it is there.
 
         Args:
-            backend: renders Gaussians there; None: the one they were trained with, or gsplat on a GPU.
+            backend: renders Gaussians there; None: as before, if that works there.
             fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
         """
 

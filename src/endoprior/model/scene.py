@@ -245,7 +245,7 @@ class SingleScene(Scene):
             return self
         return replace(
             self,
-            rendered_by=backend,
+            rendered_by=backend or self.rendered_by,
             gaussians=gaussians,
             field=field,
             prior_score=self.prior_score.to(device),

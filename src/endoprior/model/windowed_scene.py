@@ -77,6 +77,7 @@ class WindowedScene(Scene):
         self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
     ) -> WindowedScene:
         """See `Scene.to`."""
+        backend = backend or self.rendered_by
         wanted = {"device_name": str(device), "rendered_by": backend, "fp16_planes": fp16_planes}
         return self if all(getattr(self, name) == value for name, value in wanted.items()) else replace(self, **wanted)
 
