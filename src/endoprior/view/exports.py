@@ -44,6 +44,5 @@ def scene_file(scene: Scene, button: str, frame: int, progress: Progress) -> tup
     name = wanted.stem + (f"_{frame:06d}" if wanted.of_one_frame else "") + wanted.suffix
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / name
-        # Exports compute on the CPU.
-        export(scene.to("cpu", backend="numba"), file, ExportOptions(format=wanted.format, times=times), progress)
+        export(scene, file, ExportOptions(format=wanted.format, times=times), progress)
         return name, file.read_bytes()
