@@ -83,27 +83,18 @@ def evaluate(
     if isinstance(scene, (str, Path)):
         name = repr(str(scene))
         raise input_error("scene", "a trained scene", name, f"`endoprior.load_scene({name})`.")
-    rendering: dict[str, str] = {}
     if isinstance(scene, RenderedScene):
         if reading is None:
             sequence = sequence.read_as(scored_data(scene.config.data))
-        if len(sequence) != len(scene.cameras):
-            expected = f"the {len(scene.cameras)} frames the scene was trained on"
-            raise input_error(sequence.path, expected, str(len(sequence)), "pass the same sequence.")
-        _reject_other_size(scene, sequence)
+        _reject_other_frames(scene, sequence)
         sequence = sequence.with_poses(scene.cameras)  # in which it was trained; they may have been estimated again
         frames, reading = SceneFrames(scene, sequence), reading or scene.config.data
-        fps = f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
-        rendering = {"backend": scene.backend, "fps": f"{fps}{LONGEST_SECONDS:g} s; {name_of(scene.device)}"}
-        if any(scene.smoke_at(i / len(sequence)) is not None for i in sequence.indices(split)):
-            rendering["smoke"] = "images as filmed: held-out frames through smoke interpolated between training frames"
     else:
         frames = scene
-    reading = reading or DataConfig()
-    found = sequence.fingerprints()
-    result = Evaluation(_protocol(sequence, split, reading) | {"data_fingerprint": found.data} | rendering)
-    if isinstance(scene, RenderedScene) and scene.trained_on and scene.trained_on.images and found.images:
-        result.protocol["trained_on"] = _trained_on(scene.trained_on, found, sequence.path)
+    reading, fingerprints = reading or DataConfig(), sequence.fingerprints()
+    result = Evaluation(_protocol(sequence, split, reading) | {"data_fingerprint": fingerprints.data})
+    if isinstance(scene, RenderedScene):
+        result.protocol |= _facts_of(scene, sequence, split, fingerprints)
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
     context = EvaluationContext(
@@ -123,8 +114,13 @@ def evaluate(
     return result
 
 
-def _reject_other_size(scene: RenderedScene, sequence: FrameSequence) -> None:
-    """Raise InputError where the images are not those of the scene's cameras, nor the same ones shrunk otherwise."""
+def _reject_other_frames(scene: RenderedScene, sequence: FrameSequence) -> None:
+    """Raise InputError where the scene has another number of frames, or its cameras another size than the images, which
+    may be the same ones shrunk otherwise.
+    """
+    if len(sequence) != len(scene.cameras):
+        expected = f"the {len(scene.cameras)} frames the scene was trained on"
+        raise input_error(sequence.path, expected, str(len(sequence)), "pass the same sequence.")
     ours, theirs = scene.cameras[0], sequence.camera(0)
     if (ours.width, ours.height) == (theirs.width, theirs.height):
         return
@@ -135,6 +131,19 @@ def _reject_other_size(scene: RenderedScene, sequence: FrameSequence) -> None:
     if not all(max(shrink * a, other * b) < min(shrink * (a + 1), other * (b + 1)) for a, b in pairs):
         expected = f"images of {ours.width}x{ours.height} px, on which the scene was trained"
         raise input_error(sequence.path, expected, f"{theirs.width}x{theirs.height}", "pass the same sequence.")
+
+
+def _facts_of(
+    scene: RenderedScene, sequence: FrameSequence, split: Split, fingerprints: Fingerprints
+) -> dict[str, str]:
+    """What the protocol says of a scene: how it is rendered, and what it was trained on."""
+    fps = f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
+    facts = {"backend": scene.backend, "fps": f"{fps}{LONGEST_SECONDS:g} s; {name_of(scene.device)}"}
+    if any(scene.smoke_at(i / len(sequence)) is not None for i in sequence.indices(split)):
+        facts["smoke"] = "images as filmed: held-out frames through smoke interpolated between training frames"
+    if scene.trained_on and scene.trained_on.images and fingerprints.images:
+        facts["trained_on"] = _trained_on(scene.trained_on, fingerprints, sequence.path)
+    return facts
 
 
 def _trained_on(trained: Fingerprints, scored: Fingerprints, data: Path) -> str:

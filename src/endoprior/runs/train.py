@@ -308,8 +308,15 @@ class WindowedRun:
             if self.extends:
                 for file in (out / SCENE, *(window_file(out / SCENE, k) for k in range(len(self.plan)))):
                     remove_results(file.parent)
-            length = {"any_length": self.extends}
-            record_run(out, self.sequence, self.cfg, fingerprint, resume=self.resume, windows=self.plan, **length)
+            record_run(
+                out,
+                self.sequence,
+                self.cfg,
+                fingerprint,
+                resume=self.resume,
+                any_length=self.extends,
+                windows=self.plan,
+            )
 
         with held_folder(out, resume=self.resume, begin=begin):
             yield out
