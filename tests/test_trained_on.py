@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from tiny_training import tiny_config
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig, WindowConfig
 from endoprior.data import load_sequence
 from endoprior.evaluation.scoring import OTHER_IMAGES, SAME_FILES, SAME_IMAGES, evaluate
 from endoprior.model.scene_file import load_scene
@@ -87,3 +89,20 @@ def test_a_damaged_fingerprint_is_named(run):
     file.write(run / "scene.safetensors")
     with pytest.raises(InputError, match=r"scene\.safetensors: about\.trained_on\.data: expected str, got 3"):
         load_scene(run)
+
+
+def test_windows_know_their_own_images(make_tiny_sequence, tmp_path, caplog):
+    data = make_tiny_sequence("long", num_frames=20)
+    cfg = replace(tiny_config("basis", 1, 2), windows=WindowConfig(longest=12))
+    whole, sequence = train(load_sequence(data), cfg, tmp_path / "run"), load_sequence(data)
+    assert load_scene(tmp_path / "run").trained_on == whole.trained_on == sequence.fingerprints()
+    second = load_scene(tmp_path / "run/windows/001")
+    part = load_sequence(data, second.config.data)
+    assert second.trained_on == part.fingerprints() and second.trained_on.images != whole.trained_on.images
+    assert second.trained_on.data == whole.trained_on.data, "all windows are of one sequence"
+    for scene, scored_on, said in ((whole, sequence, SAME_FILES), (second, part, SAME_FILES)):
+        found = evaluate(scene, scored_on, networks=False, speed=False)
+        assert found.protocol["trained_on"] == said and not caplog.records
+    other_half = load_sequence(data, DataConfig(window="0-13"))
+    assert len(other_half) == len(second.cameras)
+    assert evaluate(second, other_half, networks=False, speed=False).protocol["trained_on"] == OTHER_IMAGES
