@@ -111,7 +111,7 @@ def test_no_module_below_the_package_has_a_public_name():
 def test_a_package_with_a_public_name_can_be_called(name, function, first):
     code = (
         f"import endoprior, inspect; {first.format(name, function)}"
-        f"assert inspect.ismodule(endoprior.{name}) and endoprior.{name}.__call__ is endoprior.{name}.{function};"
+        f"assert inspect.ismodule(endoprior.{name}) and endoprior.{name}.__wrapped__ is endoprior.{name}.{function};"
         f"assert inspect.signature(endoprior.{name}) == inspect.signature(endoprior.{name}.{function})"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

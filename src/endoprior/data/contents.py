@@ -42,7 +42,7 @@ def demand_same(files: Sequence[Path], states: Sequence[State], before: Sequence
 def fingerprints_of(files: Sequence[Path], images: Sequence[Path], folder: Path) -> Fingerprints:
     """The fingerprints of a sequence in a folder: `files` are all of it, `images` some of them."""
     digests = dict[Path, bytes]()
-    for file in set(files):
+    for file in sorted(set(files)):
         with reading(file), file.open("rb") as content:
             digests[file] = hashlib.file_digest(content, "sha256").digest()
 
