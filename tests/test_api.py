@@ -53,6 +53,17 @@ def test_no_import_replaces_a_public_name():
     subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True)
 
 
+def test_a_wrong_call_names_what_was_called(tmp_path):
+    for call, said in (
+        (lambda: endoprior.phantom(tmp_path / "out", frames=12), "got an unexpected keyword argument 'frames'"),
+        (endoprior.phantom, "missing a required argument: 'out'"),
+    ):
+        with pytest.raises(TypeError) as caught:
+            call()
+        assert str(caught.value) == f"endoprior.phantom(out, cfg, progress): {said}"
+    assert [*inspect.signature(endoprior.export).parameters] == ["scene", "out", "options", "progress"]
+
+
 FUNCTIONS = {name for name in endoprior.__all__ if not inspect.isclass(getattr(endoprior, name))}
 CHAIN = ("phantom", "train")
 """Functions whose examples write what the others open, DATA and RUN."""
@@ -106,7 +117,7 @@ for name, function in CALLABLE.items():
         exec(f"import endoprior; {first}")
         package = getattr(sys.modules["endoprior"], name)
         expected = getattr(package, function)
-        assert inspect.ismodule(package) and package.__call__ is expected, (name, first)
+        assert inspect.ismodule(package) and package.__wrapped__ is expected, (name, first)
         assert inspect.signature(package) == inspect.signature(expected), (name, first)
 """
     subprocess.run([sys.executable, "-c", code.replace("CALLABLE", repr(CALLABLE))], check=True)

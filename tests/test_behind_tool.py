@@ -63,14 +63,19 @@ def test_training_frames_have_none(sequence) -> None:
     assert sequence.truth.seen(0) is None
 
 
-def scored(sequence, split: str) -> Evaluation:
-    """Scores of a rendering that is off by 0.1 where it was seen (20 dB), by 0.01 where it was not (40 dB)."""
+def scored(sequence, split: str, wrong=None) -> Evaluation:
+    """Scores of a rendering that is off by 0.1 and 1 mm where it is `wrong` (20 dB), by 0.01 elsewhere (40 dB).
+
+    Args:
+        wrong: of a frame; None: color is where some training frame shows what the tool hides, depth is right.
+    """
     rendered = {}
     for index in sequence.indices(split):
-        seen = sequence.truth.seen(index)
+        seen = sequence.truth.seen(index) if wrong is None else wrong(index)
         error = np.where(False if seen is None else seen, 0.1, 0.01)[..., None]
         rgb = sequence.truth.tissue(index) / 255 + error
-        rendered[index] = SimpleNamespace(rgb=rgb, depth=sequence.truth.depth(index))
+        depth = sequence.truth.depth(index) + (0 if wrong is None else wrong(index))
+        rendered[index] = SimpleNamespace(rgb=rgb, depth=depth.astype(np.float32))
     context = SimpleNamespace(sequence=sequence, frames=sequence.frames(split), rendered=rendered)
     context.tissue_color = lambda index: rendered[index].rgb
     context.result = Evaluation({})
@@ -93,3 +98,15 @@ def test_with_another_split_it_is_not_known_what_training_frames_show(sequence, 
     found = scored(sequence.with_test_phase(3), split)
     assert found.skipped["psnr_behind_tool_seen"] == found.skipped["psnr_behind_tool_guessed"] == other_views.NO_SEEN
     assert 20 < found.scores["psnr_behind_tool"] <= 40.01
+
+
+def test_a_border_and_drawings_are_no_tools(tmp_path) -> None:
+    """Only there the rendering is wrong, which masks of tools cover as well."""
+    write_phantom(tmp_path / "s", PhantomConfig(frames=4, width=96, height=80, border="oval", overlay=True))
+    sequence = load_sequence(tmp_path / "s")
+    over = sequence.truth.printed_over(1)
+    hidden = ~sequence.frame(1).tissue_mask
+    assert (over & hidden).any() and (hidden & ~over).any() and not (over & sequence.frame(1).tissue_mask).any()
+    scores = scored(sequence, "test", lambda index: sequence.truth.printed_over(index)).scores
+    assert scores["psnr_behind_tool"] == pytest.approx(40, abs=0.01)
+    assert scores["depth_rmse_behind_tool_mm"] == 0

@@ -14,9 +14,10 @@ from export_readers import read_glb, read_spz
 from export_scenes import export, moving_run, moving_scene
 from plyfile import PlyData
 
+import endoprior as api
 from endoprior.cli import main
 from endoprior.core.types import Splats
-from endoprior.export.formats import FORMATS, formats_of, load_format
+from endoprior.export.formats import FORMATS, ExportOptions, formats_of, load_format
 from endoprior.export.frames import depth_png
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.scene_file import load_scene
@@ -332,6 +333,19 @@ def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, capsys, out, op
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.html"])
+def test_a_scene_on_a_gpu_is_exported(run, tmp_path, monkeypatch, name):
+    """The device `meta` stands for one whose numbers NumPy cannot read."""
+    scene = load_scene(run)
+    away = {key: value.to("meta") for key, value in scene.gaussians.tensors.items()}
+    on_gpu = replace(scene, gaussians=Gaussians(away))
+    monkeypatch.setattr(type(scene), "to", lambda self, device, **_: scene if str(device) == "cpu" else self)
+    options = ExportOptions() if name == "a.html" else ExportOptions(times=(0.5,))
+    for folder, each in (("there", on_gpu), ("here", scene)):
+        api.export(each, tmp_path / folder / name, options)
+    assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
 def test_a_failure_leaves_nothing(run, tmp_path, monkeypatch):

@@ -4,10 +4,12 @@ import json
 from dataclasses import replace
 
 import torch
+from matplotlib.figure import Figure
 
 from endoprior.core.config import ReleasedMethod
 from endoprior.model.presets import preset
-from endoprior.runs.log import growth_of
+from endoprior.runs.log import growth_of, iterations_done
+from endoprior.runs.report import plot_loss
 from endoprior.training.density import DensityStats, plan
 from endoprior_studies.matrix import Matrix
 from endoprior_studies.report import silent_rules
@@ -57,6 +59,21 @@ def test_there_is_no_growth_without_a_log_or_without_gaussians(tmp_path):
     assert growth_of(tmp_path) is None
     (tmp_path / "log.jsonl").write_text(line(10, 0))
     assert growth_of(tmp_path) is None
+
+
+def test_iterations_of_stages_and_windows_add_up():
+    """Lines are not evenly spaced: events of density control have some of their own."""
+    lines = [("coarse", 10), ("coarse", 13), ("coarse", 20), ("fine", 4), ("fine", 10)]
+    log = [{"stage": stage, "iteration": iteration, "terms": {"color": 0.5}} for stage, iteration in lines]
+    assert iterations_done(log) == [10, 13, 20, 24, 30]
+    windows = [line | {"window": k} for k in range(2) for line in log]
+    assert iterations_done(windows) == [10, 13, 20, 24, 30, 40, 43, 50, 54, 60] and iterations_done([]) == []
+    axis = Figure().subplots()
+    plot_loss(axis, windows)
+    curve, *borders = axis.lines
+    assert [*curve.get_xdata()] == iterations_done(windows) and [line.get_xdata()[0] for line in borders] == [20, 50]
+    (entry,) = axis.get_legend().get_texts()
+    assert entry.get_text() == "fine stage begins"
 
 
 def test_the_report_warns_of_rules_that_never_fired(tmp_path):

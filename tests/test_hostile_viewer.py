@@ -21,7 +21,8 @@ from endoprior.view import panel as panels
 from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES
 from endoprior.view.incoming import MAX_WAITING, JobQueue, is_valid_message
 from endoprior.view.panel import CLEAR, ORBIT, control_id
-from endoprior.view.server import MAX_KEPT, Viewer, keep
+from endoprior.view.saving import keep
+from endoprior.view.server import MAX_KEPT, Viewer
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewport import bounded_aspect
 

@@ -54,6 +54,20 @@ def test_values_are_those_of_the_log_and_a_resumed_run_shows_them_once(tiny_sequ
     assert scalars["held-out frames/psnr"] == [(50, 30.0)]
 
 
+def test_lines_that_are_shown_are_not_read_again(tmp_path):
+    """A training of 30,000 iterations took half an hour longer for that."""
+    pytest.importorskip("tensorboard")
+    log, events = tmp_path / "log.jsonl", EventFiles(tmp_path)
+    log.write_text(json.dumps({"stage": "fine", "iteration": 10, "terms": {"color": 0.5}}) + "\n")
+    assert events.follow() == (tmp_path, 10)
+    log.write_text("shown before\n" + json.dumps({"stage": "fine", "iteration": 20, "terms": {"color": 0.4}}) + "\n")
+    assert events.follow() == (tmp_path, 20) and events.follow() is None
+    with open(log, "a") as file:
+        file.write("broken\n{}\n")
+    with pytest.raises(InputError, match=r"log\.jsonl, line 3: expected an iteration as JSON, got 'broken'"):
+        events.follow()
+
+
 def test_the_command_writes_them_and_each_window_has_its_own(make_tiny_sequence, tmp_path, capsys):
     pytest.importorskip("tensorboard")
     data, run = make_tiny_sequence("long", num_frames=20), tmp_path / "run"

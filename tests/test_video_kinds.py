@@ -347,6 +347,14 @@ def test_an_animated_webp_is_a_video(tmp_path):
     assert source.frames_per_second == pytest.approx(25)
 
 
+def test_an_animated_webp_without_durations_has_the_usual_rate(tmp_path):
+    first, *others = map(Image.fromarray, smooth(6))
+    first.save(tmp_path / "a.webp", save_all=True, append_images=others, duration=0, lossless=True)
+    source = open_source(tmp_path / "a.webp")
+    assert [image.seconds for image in source] == pytest.approx([k / 25 for k in range(6)])
+    assert source.frames_per_second == 25 and source.seconds == pytest.approx(6 / 25)
+
+
 @pytest.mark.parametrize("name", ["a.mov", "a.webp", "a.gif"])
 def test_transparent_parts_of_videos_are_said(tmp_path, name):
     images = [np.dstack([image, np.full(image.shape[:2], 255, np.uint8)]) for image in smooth(4)]

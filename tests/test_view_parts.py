@@ -14,7 +14,7 @@ from endoprior.view.browsers import Browsers
 from endoprior.view.layers import NO_LINES, draw_lines, render_points, ruler, track_lines
 from endoprior.view.measure import Measurement, measurement_text, pick
 from endoprior.view.panel import POINTS_OF
-from endoprior.view.server import keep, mp4_bytes
+from endoprior.view.saving import keep, video_file
 from endoprior.view.viewable import frame_due, shrink_factor
 from endoprior.view.viewport import (
     PathPoint,
@@ -174,7 +174,7 @@ def test_files_are_never_overwritten_and_stay_in_the_folder(tmp_path):
     picture = np.zeros((8, 8, 3), np.uint8)
     first, second = (keep(tmp_path / "view", "a.png", encode_png(picture)) for _ in range(2))
     assert first != second and first.read_bytes() == second.read_bytes()
-    assert b"ftyp" in mp4_bytes([picture] * 3, 10.0)[:32]
+    assert b"ftyp" in video_file([picture] * 3, 10.0)[:32]
     for name in ("../a.png", "/etc/a.png", "b/a.png", ".."):
         with pytest.raises(ValueError, match="plain file name"):
             keep(tmp_path / "view", name, b"")

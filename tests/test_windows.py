@@ -225,6 +225,14 @@ def stored(folder: Path) -> Path:
     return folder
 
 
+def test_a_chosen_backend_is_kept(tmp_path):
+    windowed = load_scene(stored(tmp_path / "run"))
+    for scene in (windowed, windowed.windows[0].scene):
+        chosen = scene.to("cpu", backend="reference")
+        assert chosen.to("cpu").backend == chosen.to(torch.device("cpu")).backend == "reference"
+        assert chosen.to("cpu", backend="numba").backend == "numba" and scene.to("cpu") is scene
+
+
 def test_a_saved_scene_comes_back(tmp_path):
     scene = load_scene(stored(tmp_path / "run"))
     assert isinstance(scene, WindowedScene) and len(scene) == 2 * 1271

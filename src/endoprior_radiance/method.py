@@ -50,7 +50,9 @@ class RadianceMethod(Method):
         field.load_state_dict(part(arrays, "field."))
         if wrong := field.wrong_values():
             raise InputError(f"expected {wrong}; got something else.")
-        return RadianceScene(field, facts.config, cameras, facts.frames_per_second, facts.lengths_are_relative)
+        return RadianceScene(
+            field, facts.config, cameras, facts.frames_per_second, facts.lengths_are_relative, facts.trained_on
+        )
 
 
 ENDONERF = RadianceMethod(EndoNeRF, presets.endonerf)

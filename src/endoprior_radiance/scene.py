@@ -10,7 +10,7 @@ import torch
 from typing_extensions import override
 
 from endoprior import Camera, Config
-from endoprior.core.types import RenderedView
+from endoprior.core.types import Fingerprints, RenderedView
 from endoprior.model.rendered_scene import RenderedScene
 from endoprior.model.scene_facts import SCENE_FORMAT, camera_arrays, scene_facts
 from endoprior.render import Backend
@@ -33,6 +33,7 @@ class RadianceScene(RenderedScene):
     cameras: tuple[Camera, ...]
     frames_per_second: float
     lengths_are_relative: bool = False
+    trained_on: Fingerprints | None = None
 
     @property
     @override

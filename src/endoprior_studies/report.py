@@ -117,7 +117,7 @@ def _protocol(matrices: list[Matrix], level: int) -> list[str]:
     folders = [folder for matrix in matrices for folder in matrix.done.values()]
     if not folders:
         return []
-    hidden = ("frames", "data_fingerprint", "shrink", "tags")
+    hidden = ("frames", "data_fingerprint", "trained_on", "shrink", "tags")
     whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
     shown = {name: text for name, text in whole.items() if name not in hidden}
     shown["split_rule"] = "; ".join(sorted({scores_of(folder)["protocol"]["split_rule"] for folder in folders}))

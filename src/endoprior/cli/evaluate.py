@@ -85,13 +85,16 @@ class Eval(Command):
 
     def score_run(self, scene: RenderedScene, run: Path, extra: Mapping[str, float] | None = None) -> Evaluation:
         """Score the `scene` of a run folder, write the two files with these `extra` scores, print a table."""
-        from ..evaluation.scoring import evaluate, scored_data
+        from ..evaluation.scoring import SAME_IMAGES, evaluate, scored_data
         from ..runs.folder import sequence_of_run
         from ..runs.log import growth_of, mask_facts
 
         # Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
         sequence = load_sequence(self.data or sequence_of_run(run), scored_data(scene.config.data))
         result = evaluate(scene, sequence, self.split, **self._how())
+        if result.protocol.get("trained_on") == SAME_IMAGES:
+            facts = "masks, depth, poses or sequence.json"
+            say(f"note: {sequence.path}: {facts} changed since the training; the scores are against them as they are")
         growth = growth_of(run)
         result.scores |= dict(extra or {}) | ({"gaussians_growth": growth.ratio} if growth else {})
         result.protocol |= mask_facts(run)

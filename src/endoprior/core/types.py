@@ -79,6 +79,16 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Fingerprints:
+    """What tells a sequence from others: SHA-256, in hex, of the names and contents of its files."""
+
+    data: str
+    """Of all files: images, masks, depth, poses and descriptions."""
+    images: str
+    """Of the image of each frame alone, which other masks, depth or poses do not change; empty without such files."""
+
+
+@dataclass(frozen=True)
 class Splats:
     """Gaussians at one time, ready to render: all values are activated."""
 

@@ -99,7 +99,7 @@ def assemble(
         path,
         [shrunk_camera(camera, cfg.shrink) for camera in cameras],
         read_frame,
-        image_names=[image.stem for image in images],
+        image_files=images,
         files=[*images, *files, *(right_eye.files if right_eye else [])],
         right_eye=right_eye,
         mask_name=mask_folder,

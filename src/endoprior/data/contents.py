@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from ..core.checks import input_error
-from ..core.types import Frame
+from ..core.types import Fingerprints, Frame
 from ..footage.components import Image, Mask, square
 from ..footage.dark_outline import brightness
 from .image_folders import has_depth, how_to_add_depth
@@ -39,14 +39,20 @@ def demand_same(files: Sequence[Path], states: Sequence[State], before: Sequence
             raise input_error(file, "data that stays as it is during training", "a file that was changed", fix)
 
 
-def fingerprint_of(files: Sequence[Path], folder: Path) -> str:
-    """SHA-256, in hex, of the names (below the folder) and contents of files."""
-    digest = hashlib.sha256()
-    for file in sorted(files):
-        digest.update(os.fsencode(file.relative_to(folder).as_posix()) + b"\0")
+def fingerprints_of(files: Sequence[Path], images: Sequence[Path], folder: Path) -> Fingerprints:
+    """The fingerprints of a sequence in a folder: `files` are all of it, `images` some of them."""
+    digests = dict[Path, bytes]()
+    for file in sorted(set(files)):
         with reading(file), file.open("rb") as content:
-            digest.update(hashlib.file_digest(content, "sha256").digest())
-    return digest.hexdigest()
+            digests[file] = hashlib.file_digest(content, "sha256").digest()
+
+    def joined(some: Sequence[Path]) -> str:
+        whole = hashlib.sha256()
+        for file in sorted(some):
+            whole.update(os.fsencode(file.relative_to(folder).as_posix()) + b"\0" + digests[file])
+        return whole.hexdigest()
+
+    return Fingerprints(joined(files), joined(images) if images else "")
 
 
 class FrameContents(NamedTuple):

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error, number_ranges
 from ..core.config import DataConfig
-from ..core.types import Camera, Frame
+from ..core.types import Camera, Fingerprints, Frame
 from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
-from .contents import demand_same, demand_trainable, fingerprint_of, frame_contents, state_of, weighted
+from .contents import demand_same, demand_trainable, fingerprints_of, frame_contents, state_of, weighted
 from .description import ESTIMATED_POSES, TOOLS_FOUND
 from .scale import Scale
 from .truth import RightEye, Truth
@@ -65,8 +65,8 @@ class FrameSequence:
     _: KW_ONLY
     frames_per_second: float | None = None
     """Of the video, None if unknown."""
-    image_names: list[str] = field(default_factory=list)
-    """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
+    image_files: list[Path] = field(default_factory=list)
+    """The color image of each frame; empty if frames are not files of their own."""
     files: list[Path] = field(default_factory=list)
     """Every file that makes up the sequence."""
     truth: Truth | None = None
@@ -105,6 +105,11 @@ class FrameSequence:
         self._states = [state_of(file) for file in self.files]
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
         self._holds_out, self._first, self._test_phase = False, 0, 0
+
+    @property
+    def image_names(self) -> list[str]:
+        """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
+        return [file.stem for file in self.image_files]
 
     @property
     def masks_are_found(self) -> bool:
@@ -266,7 +271,7 @@ class FrameSequence:
             _cameras=self._cameras[start:stop],
             _first=self._first + start,
             _read_frame=lambda index: replace(self._read_frame(start + index), index=index, time=index / num),
-            image_names=self.image_names[start:stop],
+            image_files=self.image_files[start:stop],
             mask_files=self.mask_files[start:stop],
             frame_weights=None if self.frame_weights is None else self.frame_weights[start:stop],
             new_mask_files=[],  # the reader wants those of all frames
@@ -310,7 +315,11 @@ class FrameSequence:
 
     def fingerprint(self) -> str:
         """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
-        return fingerprint_of(self.files, self.path)
+        return self.fingerprints().data
+
+    def fingerprints(self) -> Fingerprints:
+        """That of all files, and that of the images of its frames."""
+        return fingerprints_of(self.files, self.image_files, self.path)
 
     def demand_unchanged(self, fingerprint: str | None = None) -> None:
         """Raise InputError if a file changed since the sequence was opened, so that frames of two states may be mixed.

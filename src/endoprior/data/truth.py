@@ -88,6 +88,12 @@ class Truth:
         stored = self._map(f"seen/{self._names[index]}.npy")
         return None if stored is None else stored.astype(bool)
 
+    def printed_over(self, index: int) -> NDArray[np.bool_] | None:
+        """(H, W) True on the border around frame `index` and on drawings over it, which are no tools; None without."""
+        parts = [self._map(name) for name in ("border.npy", f"overlay/{self._names[index]}.npy")]
+        found = [part.astype(bool) for part in parts if part is not None]
+        return np.logical_or.reduce(found) if found else None
+
     @cached_property
     def side_poses(self) -> dict[str, NDArray[np.float64]]:
         """Cameras beside the endoscope by name: (4, 4) rigid transforms from the frame's camera axes; empty without."""

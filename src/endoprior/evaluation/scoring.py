@@ -5,6 +5,7 @@ A score that cannot be computed is listed as skipped, with the reason. No other 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from ..compute.parallel_kernels import start_threads
 from ..core.checks import input_error
 from ..core.config import DataConfig
+from ..core.types import Fingerprints
 from ..data import FrameSequence, Split, check_sequence
 from ..model.scene import RenderedScene
 from ..system.devices import name_of
@@ -25,6 +27,14 @@ from .protocols.table import OURS
 from .registry import REGISTRY, SCORERS, scorers
 from .score import ScoreUnavailable
 from .scorers.model import FPS_RENDERS, LONGEST_SECONDS
+
+SAME_FILES = "these files"
+SAME_IMAGES = "these images; masks, depth, poses or descriptions were others"
+OTHER_IMAGES = "other images"
+"""What a scene was trained on, compared with what it is scored on: `trained_on` of the protocol."""
+SHOWN_DIGITS = 8  # of a fingerprint, in a warning
+
+log = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -57,8 +67,8 @@ def evaluate(
         protocols: also score as these papers did, into `Evaluation.protocols`.
     Raises:
         InputError: the sequence is not the one the scene was trained on: the number of frames differs, or their size,
-            except by `shrink`. Another sequence of this length and size is scored all the same: `data_fingerprint` in
-            `Evaluation.protocol` and `config.json` of the run tell them apart.
+            except by `shrink`. Other images of this number and size are scored all the same, with a warning; other
+            masks, depth or poses without one. `trained_on` in `Evaluation.protocol` says which it was.
         RuntimeError: this process is a fork of one that has rendered or trained.
 
     Example:
@@ -73,24 +83,18 @@ def evaluate(
     if isinstance(scene, (str, Path)):
         name = repr(str(scene))
         raise input_error("scene", "a trained scene", name, f"`endoprior.load_scene({name})`.")
-    rendering: dict[str, str] = {}
     if isinstance(scene, RenderedScene):
         if reading is None:
             sequence = sequence.read_as(scored_data(scene.config.data))
-        if len(sequence) != len(scene.cameras):
-            expected = f"the {len(scene.cameras)} frames the scene was trained on"
-            raise input_error(sequence.path, expected, str(len(sequence)), "pass the same sequence.")
-        _reject_other_size(scene, sequence)
+        _reject_other_frames(scene, sequence)
         sequence = sequence.with_poses(scene.cameras)  # in which it was trained; they may have been estimated again
         frames, reading = SceneFrames(scene, sequence), reading or scene.config.data
-        fps = f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
-        rendering = {"backend": scene.backend, "fps": f"{fps}{LONGEST_SECONDS:g} s; {name_of(scene.device)}"}
-        if any(scene.smoke_at(i / len(sequence)) is not None for i in sequence.indices(split)):
-            rendering["smoke"] = "images as filmed: held-out frames through smoke interpolated between training frames"
     else:
         frames = scene
-    reading = reading or DataConfig()
-    result = Evaluation(_protocol(sequence, split, reading) | rendering)
+    reading, fingerprints = reading or DataConfig(), sequence.fingerprints()
+    result = Evaluation(_protocol(sequence, split, reading) | {"data_fingerprint": fingerprints.data})
+    if isinstance(scene, RenderedScene):
+        result.protocol |= _facts_of(scene, sequence, split, fingerprints)
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
     context = EvaluationContext(
@@ -110,8 +114,13 @@ def evaluate(
     return result
 
 
-def _reject_other_size(scene: RenderedScene, sequence: FrameSequence) -> None:
-    """Raise InputError where the images are not those of the scene's cameras, nor the same ones shrunk otherwise."""
+def _reject_other_frames(scene: RenderedScene, sequence: FrameSequence) -> None:
+    """Raise InputError where the scene has another number of frames, or its cameras another size than the images, which
+    may be the same ones shrunk otherwise.
+    """
+    if len(sequence) != len(scene.cameras):
+        expected = f"the {len(scene.cameras)} frames the scene was trained on"
+        raise input_error(sequence.path, expected, str(len(sequence)), "pass the same sequence.")
     ours, theirs = scene.cameras[0], sequence.camera(0)
     if (ours.width, ours.height) == (theirs.width, theirs.height):
         return
@@ -122,6 +131,35 @@ def _reject_other_size(scene: RenderedScene, sequence: FrameSequence) -> None:
     if not all(max(shrink * a, other * b) < min(shrink * (a + 1), other * (b + 1)) for a, b in pairs):
         expected = f"images of {ours.width}x{ours.height} px, on which the scene was trained"
         raise input_error(sequence.path, expected, f"{theirs.width}x{theirs.height}", "pass the same sequence.")
+
+
+def _facts_of(
+    scene: RenderedScene, sequence: FrameSequence, split: Split, fingerprints: Fingerprints
+) -> dict[str, str]:
+    """What the protocol says of a scene: how it is rendered, and what it was trained on."""
+    fps = f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
+    facts = {"backend": scene.backend, "fps": f"{fps}{LONGEST_SECONDS:g} s; {name_of(scene.device)}"}
+    if any(scene.smoke_at(i / len(sequence)) is not None for i in sequence.indices(split)):
+        facts["smoke"] = "images as filmed: held-out frames through smoke interpolated between training frames"
+    if scene.trained_on and scene.trained_on.images and fingerprints.images:
+        facts["trained_on"] = _trained_on(scene.trained_on, fingerprints, sequence.path)
+    return facts
+
+
+def _trained_on(trained: Fingerprints, scored: Fingerprints, data: Path) -> str:
+    """What a scene was trained on, in words; a warning where that is another video than it is scored on.
+
+    Masks that were corrected, or depth that was added, belong to the same video.
+    """
+    if trained == scored:
+        return SAME_FILES
+    if trained.images == scored.images:
+        return SAME_IMAGES
+    ours, theirs = (each.images[:SHOWN_DIGITS] for each in (trained, scored))
+    expected, got = f"the images that the scene was trained on (SHA-256 {ours}...)", f"others ({theirs}...)"
+    fix = "`endoprior eval RUN --data FOLDER` with those images."
+    log.warning("warning: %s", input_error(data, expected, got, fix))
+    return OTHER_IMAGES
 
 
 def scored_data(trained: DataConfig) -> DataConfig:
@@ -149,5 +187,4 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "right_*": "tissue that both eyes see by measured depth; right pictures as they are, left mask",
         "poses": "of the scene",
         "depth_instability_mm": "all adjacent frames of the video",
-        "data_fingerprint": sequence.fingerprint(),
     }

@@ -37,7 +37,7 @@ def export(
     options: ExportOptions | None = None,
     progress: Progress = lambda *_: None,
 ) -> list[Path]:
-    """Write `scene` in the format that `options` names, whole or not at all.
+    """Write `scene`, of any device, in the format that `options` names, whole or not at all.
 
     Args:
         scene: from `train` or `load_scene`.
@@ -56,7 +56,8 @@ def export(
         >>> [file.name for file in files]
         ['tissue.ply']
     """
-    scene, out, options = with_gaussians(scene), Path(out), options or ExportOptions()
+    scene = with_gaussians(scene).to("cpu")  # where formats read its numbers
+    out, options = Path(out), options or ExportOptions()
     name = format_name(out, options)
     chosen = load_format(name)
     for field in fields(options):

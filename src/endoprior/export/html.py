@@ -112,6 +112,18 @@ def write_html(
         times = [i / len(scene.cameras) for i in range(len(scene.cameras))]
     if not times or any(b <= a for a, b in pairwise(times)):
         raise input_error("times", "one or more increasing times", f"{times}", "list each time once.")
+    data, of_blocks = _packed_blocks(scene, times, out, max_bytes)
+    about, unit = _about(scene, times), length_unit(scene.lengths_are_relative)
+    page = _page(title or DEFAULT_TITLE, remark, unit, about | {"unit": unit} | of_blocks, data).encode()
+    if len(page) > max_bytes:
+        raise _too_large(out, max_bytes, len(page), len(times), of_blocks["gaussians"])
+    with whole_file(out) as temporary:
+        temporary.write_bytes(page)
+    return out
+
+
+def _packed_blocks(scene: Scene, times: list[float], out: Path, max_bytes: int) -> tuple[bytes, dict[str, Any]]:
+    """The data of the page, and what it must know of them; errors as in `write_html`."""
     blocks, streams, num_shown, focus, depths = [], [], np.zeros(len(times), int), {}, []
     for block in quantized_blocks(scene, times):
         data, coded = pack(block.values)
@@ -129,21 +141,13 @@ def write_html(
             raise _too_large(out, max_bytes, size * len(times) / stop, len(times), num_shown.max())
     if not blocks:
         raise InputError(NOTHING_VISIBLE)
-    unit = length_unit(scene.lengths_are_relative)
-    about = _about(scene, times) | {
-        "unit": unit,
+    return b"".join(streams), {
         "gaussians": int(num_shown.max()),
         "focus": np.interp(range(len(times)), list(focus), list(focus.values())).round(3).tolist(),
         "depth_range": [min(depths), max(depths)],
         "channels": CHANNELS,
         "blocks": blocks,
     }
-    page = _page(title or DEFAULT_TITLE, remark, unit, about, b"".join(streams)).encode()
-    if len(page) > max_bytes:
-        raise _too_large(out, max_bytes, len(page), len(times), num_shown.max())
-    with whole_file(out) as temporary:
-        temporary.write_bytes(page)
-    return out
 
 
 def _too_large(out: Path, max_bytes: int, num_bytes: float, num_times: int, num_gaussians: int) -> PageTooLarge:

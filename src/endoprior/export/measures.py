@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.geometry import length_unit, project, unit_vectors
+from ..core.geometry import Strain, length_unit, project, unit_vectors
 from ..model.carry import CarriedPoints, carry
-from ..model.measures import SurfaceMotion, distance, measures_of
+from ..model.measures import Measures, SurfaceMotion, distance, measures_of
 from ..model.scene import Scene
-from ..model.surface import render_surface
+from ..model.surface import Surface, render_surface
 from ..model.uncertainty import point_errors
 from ..system.atomic import whole_folder
 from ..visualization.measures import displacement_span, measures_csv, stretch_span, value_colors, write_figure
 from .axes import points_in_axes
-from .formats import ExportFormat, ExportOptions, Progress
+from .formats import Axes, ExportFormat, ExportOptions, Progress
 from .mesh import depth_grid
 from .ply import colored, ply_bytes
 from .tracks import back_projected, read_query_points
@@ -34,6 +35,71 @@ VTK_KINDS = {"<f4": "Float32", "<i4": "Int32"}
 VTK_HEAD = '<?xml version="1.0"?>\n<VTKFile type="{}" version="1.0" byte_order="LittleEndian" header_type="UInt64">'
 
 
+@dataclass(frozen=True)
+class MovingSurface:
+    """The surface that frame `since` shows, and where and how deformed it is in each of `frames`."""
+
+    since: int
+    until: int
+    frames: list[int]
+    """All from the first to the last of the two."""
+    shown: Surface
+    """What frame `since` shows."""
+    vertices: NDArray[np.float32]
+    """(V, 3) in frame `since`, world axes, mm."""
+    triangles: NDArray[np.int32]
+    """(F, 3) vertex numbers."""
+    moved: NDArray[np.float32]
+    """(T, V, 3) the vertices in each frame."""
+    displacement: NDArray[np.floating]
+    """(T, V) straight distance from frame `since`, mm; NaN where unknown, as in what follows."""
+    strain: Strain
+    """(T, V) since frame `since`."""
+    range95: NDArray[np.float64]
+    """(V,) half of the range of the displacement at `until`, mm."""
+
+    @property
+    def maps(self) -> dict[str, NDArray]:
+        """(V,) displacement and largest principal stretch at `until`."""
+        end = self.frames.index(self.until)
+        return {"displacement": self.displacement[end], "stretch": self.strain.stretch[end, :, 0]}
+
+
+def moving_surface(scene: Scene, options: ExportOptions) -> MovingSurface:
+    """Carry the surface of a frame along.
+
+    Raises:
+        InputError: a frame is not in the sequence, or shows no surface.
+    """
+    num_frames = len(scene.cameras)
+    since, until = _frames(options, num_frames)
+    times = [i / num_frames for i in range(num_frames)]
+    shown = render_surface(scene, times[since], scene.cameras[since], options.min_alpha)
+    mesh = depth_grid(shown, options.mesh_step, options.max_slope)
+    if not len(mesh.triangles):
+        fix = "choose another, or lower --min-alpha."
+        raise input_error("--from-frame", "a frame that shows tissue", f"{since}", fix)
+    frames = list(range(min(since, until), max(since, until) + 1))
+    at_since = np.zeros(len(mesh.vertices), np.intp)
+    carried = carry(scene, mesh.vertices, at_since, [times[since], *(times[frame] for frame in frames)])
+    moved, ends = carried.positions[1:], [0, 1 + frames.index(until)]
+    both = CarriedPoints(carried.positions[ends], carried.spread_px[ends])
+    way = unit_vectors(moved[frames.index(until)] - mesh.vertices)
+    errors = point_errors(scene, both, at_since, [since, until])
+    return MovingSurface(
+        since,
+        until,
+        frames,
+        shown,
+        mesh.vertices,
+        mesh.triangles,
+        moved,
+        displacement=np.stack([distance(there, mesh.vertices) for there in moved]),
+        strain=SurfaceMotion(scene, since, options.min_alpha).strain(mesh.vertices.astype(np.float64), frames),
+        range95=errors.half_width(np.stack([way, way]), since_pick=True)[1],
+    )
+
+
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
     """Write the surface over time, `displacement.ply`, `stretch.ply`, `measures.png`; with points `measures.csv`.
 
@@ -41,68 +107,61 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         InputError: a frame is not in the sequence, the file of points cannot be read, or a point or the whole frame
             shows no surface.
     """
-    num_frames, rate, unit = len(scene.cameras), scene.frames_per_second, length_unit(scene.lengths_are_relative)
-    since, until = _frames(options, num_frames)
-    times, camera = [i / num_frames for i in range(num_frames)], scene.cameras[since]
-    surface = render_surface(scene, times[since], camera, options.min_alpha)
-    mesh = depth_grid(surface, options.mesh_step, options.max_slope)
-    if not len(mesh.triangles):
-        fix = "choose another, or lower --min-alpha."
-        raise input_error("--from-frame", "a frame that shows tissue", f"{since}", fix)
-    motion = SurfaceMotion(scene, since, options.min_alpha)
-    frames = list(range(min(since, until), max(since, until) + 1))
-    at_since = np.zeros(len(mesh.vertices), np.intp)
-    carried = carry(scene, mesh.vertices, at_since, [times[since], *(times[frame] for frame in frames)])
-    moved, ends = carried.positions[1:], [0, 1 + frames.index(until)]
-    both = CarriedPoints(carried.positions[ends], carried.spread_px[ends])
-    strain = motion.strain(mesh.vertices.astype(np.float64), frames)
-    values = {  # (T, V) each: straight distance, mm, and largest principal stretch, NaN where unknown
-        "displacement": np.stack([distance(there, mesh.vertices) for there in moved]),
-        "stretch": strain.stretch[..., 0],
-    }
-    others = {
-        "stretch_smallest": strain.stretch[..., 1],
-        "area_change": strain.area,
-        "direction": points_in_axes(strain.direction, options.axes),
-    }
-    maps = {name: each[frames.index(until)] for name, each in values.items()}
+    surface = moving_surface(scene, options)
+    rate, unit = scene.frames_per_second, length_unit(scene.lengths_are_relative)
+    camera, maps = scene.cameras[surface.since], surface.maps
     spans = displacement_span(maps["displacement"]), stretch_span(maps["stretch"])
-    way = unit_vectors(moved[ends[1] - 1] - mesh.vertices)
-    sure_to = point_errors(scene, both, at_since, [since, until]).half_width(np.stack([way, way]), since_pick=True)[1]
     with whole_folder(out) as folder:
-        (folder / SURFACES).mkdir()
-        about, files = f"axes {options.axes}, unit {unit}", []
-        for k, frame in enumerate(frames):
-            place, now = (
-                points_in_axes(moved[k], options.axes),
-                {name: each[k] for name, each in (values | others).items()},
-            )
-            files.append(f"{SURFACES}/{frame:06d}.vtp")
-            (folder / files[-1]).write_bytes(vtp_bytes(place, mesh.triangles, now, about))
-            progress(k, len(frames))
-        (folder / f"{SURFACES}.pvd").write_bytes(pvd_bytes({f: i / rate for f, i in zip(files, frames, strict=True)}))
-        positions = points_in_axes(mesh.vertices, options.axes)
+        _write_series(surface, folder, options.axes, unit, rate, progress)
+        positions = points_in_axes(surface.vertices, options.axes)
         # In the colors of one map, with the values of both.
-        for (name, shown), span in zip(maps.items(), spans, strict=True):
-            columns = colored(positions, value_colors(shown, span)) | maps | {"displacement_range95": sure_to}
-            (folder / f"{name}.ply").write_bytes(ply_bytes(columns, options.axes, unit, mesh.triangles))
+        for (name, values), span in zip(maps.items(), spans, strict=True):
+            columns = colored(positions, value_colors(values, span)) | maps | {"displacement_range95": surface.range95}
+            (folder / f"{name}.ply").write_bytes(ply_bytes(columns, options.axes, unit, surface.triangles))
         points, curves = np.zeros((0, 2)), None
         if options.points:
-            queries = read_query_points(options.points, scene)
-            followed = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
-            paths = followed.positions
-            around = motion.stretch(paths[since].astype(np.float64), list(range(num_frames)))
-            errors = point_errors(scene, followed, queries.frames, range(num_frames))
-            found = measures_of(paths, around, since, int(queries.frames[-1]), errors)
-            table = measures_csv(found, rate, unit, errors.confidence)
+            paths, found, confidence = _measured(scene, options, surface.since)
+            table = measures_csv(found, rate, unit, confidence)
             (folder / "measures.csv").write_text(table, encoding="utf-8", newline="\n")
-            points, curves = project(paths[since].astype(np.float64), camera)[0], (found, rate, unit)
-        on_image = project(mesh.vertices.astype(np.float64), camera)[0], mesh.triangles
+            points, curves = project(paths[surface.since].astype(np.float64), camera)[0], (found, rate, unit)
+        on_image = project(surface.vertices.astype(np.float64), camera)[0], surface.triangles
         titles = f"displacement, {unit}", "largest principal stretch; 1: unchanged"
         shown = dict(zip(titles, zip(maps.values(), spans, strict=True), strict=True))
-        title = f"frame {since} to frame {until}"
-        write_figure(folder / "measures.png", title, surface.color, points, on_image, shown, curves)
-    progress(len(frames), len(frames))
+        title = f"frame {surface.since} to frame {surface.until}"
+        write_figure(folder / "measures.png", title, surface.shown.color, points, on_image, shown, curves)
+    progress(len(surface.frames), len(surface.frames))
+
+
+def _write_series(surface: MovingSurface, folder: Path, axes: Axes, unit: str, rate: float, progress: Progress) -> None:
+    """Write the surface at each frame, and the list of these files for ParaView."""
+    values = {
+        "displacement": surface.displacement,
+        "stretch": surface.strain.stretch[..., 0],
+        "stretch_smallest": surface.strain.stretch[..., 1],
+        "area_change": surface.strain.area,
+        "direction": points_in_axes(surface.strain.direction, axes),
+    }
+    (folder / SURFACES).mkdir()
+    seconds: dict[str, float] = {}
+    for k, frame in enumerate(surface.frames):
+        file, now = f"{SURFACES}/{frame:06d}.vtp", {name: each[k] for name, each in values.items()}
+        about, place = f"axes {axes}, unit {unit}", points_in_axes(surface.moved[k], axes)
+        (folder / file).write_bytes(vtp_bytes(place, surface.triangles, now, about))
+        seconds[file] = frame / rate
+        progress(k, len(surface.frames))
+    (folder / f"{SURFACES}.pvd").write_bytes(pvd_bytes(seconds))
+
+
+def _measured(scene: Scene, options: ExportOptions, since: int) -> tuple[NDArray, Measures, NDArray[np.float32]]:
+    """Of the points of the options: (T, P, 3) their paths, mm, the measures since a frame, (T, P) confidence."""
+    assert options.points is not None, "no file of points"
+    num_frames, queries = len(scene.cameras), read_query_points(options.points, scene)
+    times = [i / num_frames for i in range(num_frames)]
+    followed = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
+    paths, motion = followed.positions, SurfaceMotion(scene, since, options.min_alpha)
+    around = motion.stretch(paths[since].astype(np.float64), list(range(num_frames)))
+    errors = point_errors(scene, followed, queries.frames, range(num_frames))
+    return paths, measures_of(paths, around, since, int(queries.frames[-1]), errors), errors.confidence
 
 
 def _frames(options: ExportOptions, num_frames: int) -> tuple[int, int]:

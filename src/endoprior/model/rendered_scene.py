@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from pathlib import Path
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -11,7 +13,7 @@ from torch import Tensor
 from .. import render
 from ..core.checks import InputError, input_error
 from ..core.config import Config
-from ..core.types import Camera, RenderedView, Splats
+from ..core.types import Camera, Fingerprints, RenderedView, Splats
 from .photometric import behind_smoke
 
 
@@ -24,6 +26,8 @@ class RenderedScene(ABC):
     frames_per_second: float
     lengths_are_relative: bool
     """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
+    trained_on: Fingerprints | None = None
+    """Those of the sequence; None: not known, as in scenes of earlier versions, or while it is trained."""
 
     @property
     @abstractmethod
@@ -42,7 +46,7 @@ class RenderedScene(ABC):
         """This scene on a device; itself if it is there.
 
         Args:
-            backend: renders Gaussians there; None: the one they were trained with, or gsplat on a GPU.
+            backend: renders Gaussians there; None: as before, if that works there.
             fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
         """
 
@@ -53,6 +57,12 @@ class RenderedScene(ABC):
         Raises:
             ValueError: its planes are in half precision.
         """
+
+    def with_fingerprints(self, trained_on: Fingerprints) -> Self:
+        """This scene, which says on which sequence it was trained."""
+        scene = copy(self)
+        vars(scene)["trained_on"] = trained_on  # of a frozen dataclass too
+        return scene
 
     @abstractmethod
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:

@@ -20,7 +20,7 @@ from .. import render
 from ..compute.parallel_kernels import demand_unforked
 from ..core.config import Config
 from ..core.geometry import share_of_right
-from ..core.types import Camera, RenderedView, Splats
+from ..core.types import Camera, Fingerprints, RenderedView, Splats
 from ..system.arrays_file import part, save_arrays
 from .gaussians import Gaussians, Offsets
 from .method import SceneKind, method_of
@@ -186,6 +186,7 @@ class SingleScene(Scene):
     """(T, I, J) share of each cell of the frame that is tissue, 0..255: see `uncertainty`; None: not known."""
     depth_noise: float = 0.0
     """How far rendered depth is from measured depth, as a share of it; 0: not known."""
+    trained_on: Fingerprints | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -244,7 +245,7 @@ class SingleScene(Scene):
             return self
         return replace(
             self,
-            rendered_by=backend,
+            rendered_by=backend or self.rendered_by,
             gaussians=gaussians,
             field=field,
             prior_score=self.prior_score.to(device),
@@ -286,6 +287,7 @@ class SingleScene(Scene):
             smoke=arrays.get("smoke"),
             tissue=arrays.get("tissue"),
             depth_noise=facts.depth_noise,
+            trained_on=facts.trained_on,
         )
 
     def save(self, path: str | Path) -> None:

@@ -13,7 +13,7 @@ from ..core.checks import InputError, check_range
 from ..core.config import Config
 from ..core.config_io import to_dict
 from ..core.ranges import Checked, Range
-from ..core.types import Camera
+from ..core.types import Camera, Fingerprints
 from .rendered_scene import RenderedScene
 
 SCENE_FORMAT = "endoprior-scene-1"
@@ -40,6 +40,7 @@ class SceneFacts(Checked):
     smoke: bool = False
     tissue: bool = False
     depth_noise: Annotated[float, Range(0, 10)] = 0.0
+    trained_on: Fingerprints | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,7 +51,8 @@ class SceneFacts(Checked):
 def scene_facts(scene: RenderedScene) -> dict[str, Any]:
     """What the metadata of every scene's file say."""
     first = scene.cameras[0]
-    return {
+    known = {} if scene.trained_on is None else {"trained_on": to_dict(scene.trained_on)}
+    return known | {
         "config": to_dict(scene.config),
         "frames_per_second": scene.frames_per_second,
         "lengths_are_relative": scene.lengths_are_relative,

@@ -144,7 +144,15 @@ def _windowed(arrays: dict[str, Tensor], facts: SceneFacts, file: Path) -> Windo
             window, f"{length} frames and {span.num_gaussians:,} Gaussians, as {file} says", got, NEXT_STEP
         )
 
-    return WindowedScene(facts.config, cameras, facts.frames_per_second, spans, read, facts.lengths_are_relative)
+    return WindowedScene(
+        config=facts.config,
+        cameras=cameras,
+        frames_per_second=facts.frames_per_second,
+        spans=spans,
+        read=read,
+        lengths_are_relative=facts.lengths_are_relative,
+        trained_on=facts.trained_on,
+    )
 
 
 def _check_spans(spans: tuple[Span, ...], num_frames: int) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from .. import render
 from ..core.config import Config
-from ..core.types import Camera
+from ..core.types import Camera, Fingerprints
 from ..system.arrays_file import save_arrays
 from ..system.memory import BoundedCache
 from .scene import Scene, SingleScene, Window
@@ -48,6 +48,7 @@ class WindowedScene(Scene):
     device_name: str = "cpu"
     """Device that windows are moved to when they are read."""
     fp16_planes: bool = False
+    trained_on: Fingerprints | None = None
 
     def __len__(self) -> int:
         return sum(span.num_gaussians for span in self.spans)
@@ -76,6 +77,7 @@ class WindowedScene(Scene):
         self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
     ) -> WindowedScene:
         """See `Scene.to`."""
+        backend = backend or self.rendered_by
         wanted = {"device_name": str(device), "rendered_by": backend, "fp16_planes": fp16_planes}
         return self if all(getattr(self, name) == value for name, value in wanted.items()) else replace(self, **wanted)
 

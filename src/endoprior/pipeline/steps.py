@@ -58,7 +58,7 @@ from .job import Job, SequenceJob
 
 @dataclass
 class HandedOn:
-    """Empty at first."""
+    """What steps leave for later ones; empty at first."""
 
     facts: KnownFacts = field(default_factory=KnownFacts)  # of the prepared frames; from `prepare` to `check`
     sequence: FrameSequence | None = None

@@ -26,7 +26,7 @@ from ..data.load import what_is_in
 from ..data.pixels import is_matte
 from ..data.reading import kind_of
 from ..data.video_files import STILL_SUFFIXES, is_animated_webp
-from .decoding import usual_rate
+from .decoding import USUAL_RATE, usual_rate
 from .video import COPY_AGAIN, SmallImage, SourceFrame, Video, demand_size, transparent
 
 OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")  # suffixes of images that are counted, but not read
@@ -152,10 +152,10 @@ class Animation:
 
 
 def _shown(file: Image, index: int) -> float:
-    """How long an image is shown, s. Pillow knows it when the image is decoded."""
+    """How long an image is shown, s; a duration of 0 says nothing. Pillow knows it when the image is decoded."""
     file.seek(index)
     file.load()
-    return float(file.info.get("duration", 0)) / 1000
+    return float(file.info.get("duration", 0)) / 1000 or 1 / USUAL_RATE
 
 
 Source = ImageFolder | Video | Animation

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 LOG_EVERY = 10  # iterations between two lines
 MISSED = "missed_tool_frames"
 """Frames whose masks likely miss a tool: in the last line, in the protocol of `metrics.json` and in `StepReport`."""
-"""Pixels around tool masks that were left out: in `config.json` of a run, and in the protocol of `metrics.json`."""
 
 
 def log_writer(lines: TextIO) -> Observer:
@@ -59,14 +58,16 @@ def cut_log(log: Path, stage: Stage, iteration: int) -> None:
         write_text(log, "".join(json.dumps(line) + "\n" for line in kept))
 
 
-def read_log(log: Path, *names: str) -> list[dict[str, Any]]:
+def read_log(log: Path, *names: str, after: int = 0) -> list[dict[str, Any]]:
     """The lines of `log.jsonl`, without a last one that a crash cut short; each must have the `names`.
 
+    Args:
+        after: lines at the start that are not looked at.
     Raises:
         InputError: it cannot be read, or another line is broken: no JSON, or a value of another type.
     """
     lines, rows = read_bytes(log, "the log of a training").tobytes().splitlines(), list[dict[str, Any]]()
-    for number, text in enumerate(lines, 1):
+    for number, text in enumerate(lines[after:], after + 1):
         try:
             row = json.loads(text)
         except (ValueError, RecursionError):
@@ -99,6 +100,17 @@ def _is_line(row: dict[str, Any]) -> bool:
     except InputError:
         return False
     return True
+
+
+def iterations_done(lines: Sequence[Mapping[str, Any]]) -> list[int]:
+    """How many iterations were done at each line of a log: those of both stages and of all windows count."""
+    done, before, last = list[int](), 0, dict[str, Any]()
+    for line in lines:
+        if last and (line["stage"], line.get("window")) != (last["stage"], last.get("window")):
+            before += last["iteration"]
+        done.append(before + line["iteration"])
+        last = line
+    return done
 
 
 @dataclass(frozen=True)
@@ -224,7 +236,7 @@ class EventFiles:
             folder = log.parent
             if not log.is_file() or (folder == self._run and any(self._run.glob(WINDOWS))):
                 continue  # the log of several windows repeats theirs
-            for line in read_log(log, "stage", "iteration")[self._shown.get(folder, 0) :]:
+            for line in read_log(log, "stage", "iteration", after=self._shown.get(folder, 0)):
                 news = folder, self._show(folder, line)
         return news
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,7 +23,7 @@ from ..visualization.image_tools import colorize, save_figure, to_u8
 from ..visualization.rendered_views import depth_span, tissue_distance, turned
 from ..visualization.tissue_layers import PaintedTissue, SupportMap
 from .folder import LOG
-from .log import LOG_EVERY, read_log
+from .log import iterations_done, read_log
 
 SHOWN_SCORES = (
     "psnr_tissue psnr ssim depth_rmse_mm flow_error_dis color_share depth_instability_mm side_psnr right_psnr "
@@ -41,7 +43,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     """
     sequence = sequence.with_poses(scene.cameras)
     scores, per_frame = read_scores(run / "metrics.json")["scores"], read_frame_scores(run / "per_frame.json")
-    log = read_log(run / LOG, "stage", "terms")
+    log = read_log(run / LOG, "stage", "iteration", "terms")
     rows = [*_image_rows(scene, sequence), _side_row(scene, sequence), _texture_row(scene, sequence)]
     # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
@@ -56,7 +58,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
             axis.imshow(image)
             axis.set_title(title, fontsize=8)
     loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
-    _plot_loss(loss_axis, log)
+    plot_loss(loss_axis, log)
     _plot_psnr(psnr_axis, per_frame)
     _write_scores(table_axis, scores, sequence.depth_is_relative)
     save_figure(figure, path)
@@ -109,12 +111,14 @@ def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArr
     return cells
 
 
-def _plot_loss(axis: Axes, log: list[dict]) -> None:
-    iterations = [LOG_EVERY * (k + 1) for k in range(len(log))]  # of both stages; the log counts each from 1
+def plot_loss(axis: Axes, log: Sequence[dict[str, Any]]) -> None:
+    """The objective over all iterations of a log, and where the fine stage of a window begins."""
+    iterations = iterations_done(log)
     axis.semilogy(iterations, [sum(line["terms"].values()) for line in log], linewidth=0.6, color="tab:red")
-    starts = [iterations[k - 1] for k in range(1, len(log)) if log[k]["stage"] != log[k - 1]["stage"]]
-    for start in starts:
-        axis.axvline(start, color="gray", linestyle=":", label="fine stage begins")
+    stages = pairwise(zip(iterations, (line["stage"] for line in log), strict=True))
+    starts = [done for (done, before), (_, after) in stages if (before, after) == ("coarse", "fine")]
+    for k, start in enumerate(starts):
+        axis.axvline(start, color="gray", linestyle=":", label="" if k else "fine stage begins")
     axis.set_title("training objective", fontsize=9)
     axis.set_xlabel("iteration", fontsize=8)
     if starts:

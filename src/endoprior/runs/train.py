@@ -16,6 +16,7 @@ from ..check.findings import find_errors
 from ..compute.parallel_kernels import start_threads
 from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config
+from ..core.types import Fingerprints
 from ..data import FrameSequence, check_sequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
 from ..model.method import method_of
@@ -200,17 +201,21 @@ class TrainingRun:
     @freed_memory_kept()
     def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> RenderedScene:
         """Train to the end; `observers` are called after each iteration, in this order. See `train`."""
-        if self.out is None:
-            self.trainer.start()
-            self.trainer.run(list(observers))
-            return with_error_sources(self.trainer.scene(), self.trainer.sequence.frames("train"))
-        out, trainer = self.out, self.trainer
-        fingerprint = trainer.sequence.fingerprint()
-        with held_folder(out, resume=self.resume, begin=lambda: self._begin(out, fingerprint)):
-            self._train_in(out, fingerprint, list(observers), checkpoint_seconds)
-            scene = with_error_sources(trainer.scene(), trainer.sequence.frames("train"))
+        out, trainer, trained_on = self.out, self.trainer, self.trainer.sequence.fingerprints()
+        if out is None:
+            trainer.start()
+            trainer.run(list(observers))
+            return self._result(trained_on)
+        with held_folder(out, resume=self.resume, begin=lambda: self._begin(out, trained_on.data)):
+            self._train_in(out, trained_on.data, list(observers), checkpoint_seconds)
+            scene = self._result(trained_on)
             scene.save(out / SCENE)
         return scene
+
+    def _result(self, trained_on: Fingerprints) -> RenderedScene:
+        """The trained scene, with what it was trained on."""
+        scene = with_error_sources(self.trainer.scene(), self.trainer.sequence.frames("train"))
+        return scene.with_fingerprints(trained_on)
 
     def _begin(self, out: Path, fingerprint: str) -> None:
         """Start or restore the trainer, and write what must be known to repeat the run."""
@@ -303,8 +308,15 @@ class WindowedRun:
             if self.extends:
                 for file in (out / SCENE, *(window_file(out / SCENE, k) for k in range(len(self.plan)))):
                     remove_results(file.parent)
-            length = {"any_length": self.extends}
-            record_run(out, self.sequence, self.cfg, fingerprint, resume=self.resume, windows=self.plan, **length)
+            record_run(
+                out,
+                self.sequence,
+                self.cfg,
+                fingerprint,
+                resume=self.resume,
+                any_length=self.extends,
+                windows=self.plan,
+            )
 
         with held_folder(out, resume=self.resume, begin=begin):
             yield out
@@ -353,4 +365,5 @@ class WindowedRun:
             spans=tuple(Span(start, stop, len(window(k))) for k, (start, stop) in enumerate(self.plan)),
             read=window,
             lengths_are_relative=self.sequence.depth_is_relative,
+            trained_on=self.sequence.fingerprints(),
         )

@@ -11,14 +11,12 @@ import io
 import ipaddress
 import secrets
 import sys
-import tempfile
 import time as clock
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,21 +25,19 @@ import viser
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..core.checks import InputError, input_error
+from ..core.checks import InputError
 from ..core.types import Camera
 from ..data.images import encode_png
-from ..system.atomic import whole_file
 from ..system.console import complain
-from ..visualization.video import write_video
 from . import panel
 from .access_control import access_control
 from .addresses import Names, check_address
 from .browsers import Browsers, camera_pose, picture_with_lines, viewport_of
-from .exports import SCENE_FILES, scene_file
 from .incoming import Job, JobQueue, RateLimit
 from .layers import Lines
 from .mask_editor import MaskEditor, Spot
 from .measure import DrawnTracks, Measuring, pick
+from .saving import SCENE_FILES, keep, scene_file, video_file
 from .viewable import IDLE_SECONDS, ViewSettings, frame_due
 from .viewport import PathPoint, Viewport, endoscope_viewport, follow_frames, interpolate
 
@@ -371,7 +367,7 @@ class Viewer:
                     yield self._picture(replace(settings, frame=place.frame), place.camera)
                     progress(k + 1, len(places))
 
-            content = mp4_bytes(pictures(), self.viewable.frames_per_second)
+            content = video_file(pictures(), self.viewable.frames_per_second)
         self._offer(client, f"{settings.layer}.mp4", content)
 
     def _save_scene(self, button: str, client: viser.ClientHandle) -> None:
@@ -399,32 +395,3 @@ def limited(job: ClientJob) -> ClientJob:
     """`job`, at most once per second: more would fill the disk."""
     rate = RateLimit(1)
     return lambda client: rate.exceeded(clock.monotonic()) or job(client)
-
-
-def mp4_bytes(pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> bytes:
-    """Images (H, W, 3) of one size as an H.264 video."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "video.mp4"
-        write_video(file, pictures, frames_per_second)
-        return file.read_bytes()
-
-
-def keep(folder: Path, name: str, content: bytes) -> Path:
-    """Write a file with the first free name `stem_N.suffix` in `folder`, and return its path; never overwrite a file.
-
-    Args:
-        name: a plain file name.
-    Raises:
-        ValueError: `name` contains a folder, or has no suffix.
-        InputError: `folder` is a link: in an untrusted run it could point anywhere.
-    """
-    if folder.is_symlink():
-        raise input_error(folder, "a folder", "a link to one", "Remove the link.")
-    stem, suffix = Path(name).stem, Path(name).suffix
-    if Path(name).name != name or not suffix:
-        raise ValueError(f"name must be a plain file name with a suffix, got {name!r}")
-    numbered = (folder / f"{stem}_{number}{suffix}" for number in count(1))
-    file = next(path for path in numbered if not path.exists())
-    with whole_file(file) as temporary:
-        temporary.write_bytes(content)
-    return file

@@ -14,6 +14,8 @@ from itertools import product
 import numpy as np
 
 from ...core.geometry import expected_depth, right_camera
+from ...core.types import Frame
+from ...footage.components import Mask
 from ...footage.stereo_order import measured_disparity, warp_to_right
 from ..context import EvaluationContext
 from ..score import Score
@@ -107,25 +109,33 @@ def score_hidden(context: EvaluationContext) -> None:
     """Score what is rendered behind the tool; nothing without ground truth."""
     if (truth := context.sequence.truth) is None:
         return
+
+    def of_tools(mask: Mask, frame: Frame) -> Mask:
+        """(H, W) a mask without the border around the image and drawings over it, which masks of tools hold too."""
+        over = truth.printed_over(frame.index)
+        return mask if over is None else mask & ~over
+
     with context.skip_if_unavailable(*(score.name for score in OF_HIDDEN if score.group == "image")):
         values, seen, guessed = [], [], []
         for frame in context.frames:
             if (true_color := truth.tissue(frame.index)) is not None:
                 rendered, target = context.tissue_color(frame.index), true_color / np.float32(255)
-                values.append(psnr_tissue(rendered, target, ~frame.tissue_mask))
+                hidden = of_tools(~frame.tissue_mask, frame)
+                values.append(psnr_tissue(rendered, target, hidden))
                 # The truth was written for the published split: with another one, other frames are training frames.
                 shown = truth.seen(frame.index) if context.sequence.test_phase == 0 else None
                 if shown is not None:
-                    seen.append(psnr_tissue(rendered, target, shown))
-                    guessed.append(psnr_tissue(rendered, target, ~(frame.tissue_mask | shown)))
+                    seen.append(psnr_tissue(rendered, target, of_tools(shown, frame)))
+                    guessed.append(psnr_tissue(rendered, target, hidden & ~shown))
         context.add_mean("psnr_behind_tool", values, "no true color behind the tool")
         context.add_mean("psnr_behind_tool_seen", seen, NO_SEEN)
         context.add_mean("psnr_behind_tool_guessed", guessed, NO_SEEN)
     with context.skip_if_unavailable("depth_rmse_behind_tool_mm"):
         values = [
-            depth_rmse(context.rendered[frame.index].depth, true_depth, ~frame.tissue_mask & (true_depth > 0))
+            depth_rmse(context.rendered[frame.index].depth, true_depth, hidden & (true_depth > 0))
             for frame in context.frames
             if (true_depth := truth.depth(frame.index)) is not None
+            for hidden in [of_tools(~frame.tissue_mask, frame)]
         ]
         context.add_mean("depth_rmse_behind_tool_mm", values, "no true depth behind the tool")
 
