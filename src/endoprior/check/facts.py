@@ -22,7 +22,7 @@ from ..data.found_tools import UNCERTAIN, read_rows
 from ..data.pixels import measured_share
 from ..data.scale import Scale
 from ..data.window_plan import look_through, plan_windows
-from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
+from ..footage.border import Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
 from ..footage.depth_unit import FAR_MM, UnitGuess
@@ -31,6 +31,7 @@ from ..footage.mask_polarity import Polarity
 from ..footage.masked_tissue import MaskedTissue, find_masked_tissue
 from ..footage.overlays import without_strokes
 from ..footage.pose_fit import PoseFit
+from ..footage.round_border import Circle
 from ..footage.text_network import TextDetector
 from ..footage.texts import resting_rectangles
 from ..initialization.sampling import initial_points

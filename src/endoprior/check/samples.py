@@ -12,8 +12,8 @@ from ..core.types import Frame
 from ..data import FrameSequence
 from ..data.files import in_order
 from ..data.images import read_color
-from ..footage.components import Image, InOrder, Mask
 from ..footage.depth_unit import UnitGuess, guess_unit
+from ..footage.image_operations import Image, InOrder, Mask
 from ..footage.mask_polarity import Polarity, mask_polarity
 from ..footage.pose_fit import PoseFit, RgbdFrame, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px

@@ -14,8 +14,7 @@ import numpy as np
 
 from ..core.checks import input_error
 from ..core.types import Frame
-from ..footage.components import Image, Mask, square
-from ..footage.dark_outline import brightness
+from ..footage.image_operations import Image, Mask, smallest_channel, square
 from .image_folders import has_depth, how_to_add_depth
 from .reading import reading
 
@@ -111,7 +110,7 @@ def overexposed(frame: Frame) -> Mask | None:
 
 def is_saturated(rgb_u8: Image) -> Mask:
     """(H, W) True where an image (H, W, 3) is saturated."""
-    return ~brightness(~rgb_u8) >= SATURATED
+    return smallest_channel(rgb_u8) >= SATURATED
 
 
 def weighted(frame: Frame, weight: float) -> Frame:

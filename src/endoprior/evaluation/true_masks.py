@@ -26,7 +26,7 @@ from ..data.images import read_color
 from ..data.mask_files import MASK_SUFFIXES, demand_known, read_user_mask, rule_of_files, tool_polarity
 from ..data.reading import kind_of
 from ..footage.border import find_outline
-from ..footage.components import Image, Mask, components, dilated, distance_inside
+from ..footage.image_operations import Image, Mask, components, dilated, distance_inside
 from ..footage.text_network import TextDetector
 from ..footage.texts import resting_rectangles
 from ..system.atomic import write_json

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Mask
+from .image_operations import Mask
 
 ROUNDS, EVERY = 8, 7  # rounds of the robust fit; every so many pixels take part in it
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .alignment import align, mean_shift
-from .components import Image, InOrder, Mask
+from .image_operations import Image, InOrder, Mask
 from .optical_flow import follow_both_ways
 
 WORK_WIDTH = 320  # Images are resized to this width, px: enough for hundreds of corners, and fast

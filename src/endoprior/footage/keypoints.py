@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image
+from .image_operations import Image
 
 
 def keypoints(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.checks import check_shape
-from .components import Image, Mask
+from .image_operations import Image, Mask
 
 LIT = 25  # Darker pixels (largest channel, 0..255) are ignored: they are outside a round border or in shadow
 MIN_LIT_REGION_SHARE = 0.0005  # A region with a smaller share of the lit pixels counts as empty

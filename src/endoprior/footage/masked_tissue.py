@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.ranges import evenly_spaced
 from .background_motion import difference_from_background
-from .components import AREA, Image, InOrder, Mask, components, disk, distance_inside
+from .image_operations import AREA, Image, InOrder, Mask, components, disk, distance_inside
 from .optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 
 SIDE_PX = 160  # shorter side of the images that are compared

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask
+from .image_operations import Image, Mask
 
 MIN_SIZE_PX = 32  # Smallest image side that dense inverse search supports
 MOTION_S = 0.1

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.geometry import CONVENTIONS, Convention, to_ours
 from ..core.ranges import evenly_spaced
-from .components import Image, InOrder, square
+from .image_operations import Image, InOrder, square
 from .optical_flow import follow_both_ways
 
 RgbdFrame = tuple[Image, NDArray, NDArray[np.float32]]

@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from .alignment import align
-from .components import Image, Mask
+from .image_operations import Image, Mask
 from .keypoints import keypoints, match_descriptors
 from .optical_flow import follow_both_ways
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask
+from .image_operations import Image, Mask
 from .text_network import TextBox
 
 MIN_SEEN = 3  # Images in which a text has to be found

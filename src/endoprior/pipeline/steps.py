@@ -34,7 +34,7 @@ from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..evaluation.verdict import Verdict, VerdictFacts, verdict_on
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
-from ..footage.components import runs
+from ..footage.image_operations import runs
 from ..footage.known_facts import KnownFacts
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene

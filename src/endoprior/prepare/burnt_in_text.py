@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..footage.components import Image, Mask
+from ..footage.image_operations import Image, Mask
 from ..footage.text_network import TextBox, TextDetector
 from ..footage.texts import confirm, follow, rectangle, text_mask
 from ..system.console import ToDo

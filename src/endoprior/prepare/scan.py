@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.components import Image, runs
 from ..footage.disturbances import FrameQuality, disturbances, measure_quality, scenes_outside, small_size, view_mask
+from ..footage.image_operations import Image, runs
 from ..footage.scenes import (
     JUMP,
     REACH,

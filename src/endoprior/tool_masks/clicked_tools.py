@@ -23,7 +23,7 @@ from ..core.checks import input_error
 from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..footage.carry_masks import sampled
-from ..footage.components import AREA, Mask, components, large_regions, regions_where
+from ..footage.image_operations import AREA, Mask, components, large_regions, regions_where
 from ..footage.optical_flow import MIN_SIZE_PX, flow_pair, gray_for_flow
 from .examples import Examples, clicked_region, examples_of, feature_map, fit
 from .mask_store import SAMPLES, view_of

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import evenly_spaced
-from ..footage.components import Mask, components, dilated, disk
+from ..footage.image_operations import Mask, components, dilated, disk
 
 SURE = 4.0  # Log-odds count up to this, so that examples can outweigh a network that is sure and wrong
 COLORS = 5  # Channels of the network's image: color, two color ratios

@@ -19,7 +19,7 @@ from ..data import FrameSequence
 from ..data.found_tools import FoundTools, FrameRow
 from ..data.images import read_tool_mask, save_png
 from ..footage.border import find_outline, masked_border
-from ..footage.components import Mask, components, regions_where
+from ..footage.image_operations import Mask, components, regions_where
 from ..system.atomic import read_json_object, whole_file, write_json
 from .network import ToolFinder, full_size
 

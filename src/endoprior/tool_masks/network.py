@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from ..core.checks import check_shape, shipped_file
 from ..data.found_tools import FoundTools
-from ..footage.components import Image, InOrder, Mask
+from ..footage.image_operations import Image, InOrder, Mask
 from .over_time import Look, decide_over_time
 from .regions import tool_regions
 

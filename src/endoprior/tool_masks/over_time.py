@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..footage.carry_masks import sampled
-from ..footage.components import Image, Mask
+from ..footage.image_operations import Image, Mask
 from ..footage.optical_flow import MIN_SIZE_PX, flow_pair
 from .regions import candidate_regions, joined
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...core.checks import check_shape
 from ...core.ranges import evenly_spaced
-from ...footage.components import Mask
+from ...footage.image_operations import Mask
 from ..score import Score, ScoreUnavailable
 
 if TYPE_CHECKING:

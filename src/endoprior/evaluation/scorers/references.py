@@ -17,7 +17,7 @@ from ...core.ranges import evenly_spaced
 from ...core.types import Camera, Frame
 from ...data import FrameList, FrameSequence
 from ...footage.alignment import align
-from ...footage.components import Mask
+from ...footage.image_operations import Mask
 from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, follow_both_ways, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene

@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from ...core.geometry import back_project, bilinear, camera_to_world, cells_at, project
 from ...core.types import Camera, Frame
 from ...data import FrameSequence, nearest_end_errors
-from ...footage.components import Image, distance_inside
+from ...footage.image_operations import Image, distance_inside
 from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene
