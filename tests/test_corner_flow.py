@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.footage.optical_flow import follow_both_ways
+from endoprior.footage.keypoints import follow_both_ways
 
 HEIGHT, WIDTH, MARGIN = 90, 120, 30
 

@@ -19,6 +19,7 @@ from ..data import FrameSequence
 from ..data.contents import overexposed
 from ..data.formats import needs_depth
 from ..data.found_tools import UNCERTAIN, read_rows
+from ..data.mask_files import Polarity
 from ..data.pixels import measured_share
 from ..data.scale import Scale
 from ..data.window_plan import look_through, plan_windows
@@ -27,7 +28,6 @@ from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
 from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.known_facts import KnownFacts
-from ..footage.mask_polarity import Polarity
 from ..footage.masked_tissue import MaskedTissue, find_masked_tissue
 from ..footage.overlays import without_strokes
 from ..footage.pose_fit import PoseFit

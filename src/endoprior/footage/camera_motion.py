@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .alignment import align, mean_shift
 from .image_operations import Image, InOrder, Mask
-from .optical_flow import follow_both_ways
+from .keypoints import follow_both_ways
 
 WORK_WIDTH = 320  # Images are resized to this width, px: enough for hundreds of corners, and fast
 MAX_CORNERS = 400

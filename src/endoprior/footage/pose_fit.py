@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core.geometry import CONVENTIONS, Convention, to_ours
 from ..core.ranges import evenly_spaced
 from .image_operations import Image, InOrder, square
-from .optical_flow import follow_both_ways
+from .keypoints import follow_both_ways
 
 RgbdFrame = tuple[Image, NDArray, NDArray[np.float32]]
 """Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""

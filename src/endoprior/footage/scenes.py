@@ -20,8 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .alignment import align
 from .image_operations import Image, Mask
-from .keypoints import keypoints, match_descriptors
-from .optical_flow import follow_both_ways
+from .keypoints import follow_both_ways, keypoints, match_descriptors
 
 CORNERS, FEATURES = 200, 400  # most corners that are followed, and features that are compared, in an image
 MIN_MATCHES = 12  # so many points must move together; of images of different places, up to 7 do by chance

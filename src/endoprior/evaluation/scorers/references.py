@@ -18,7 +18,8 @@ from ...core.types import Camera, Frame
 from ...data import FrameList, FrameSequence
 from ...footage.alignment import align
 from ...footage.image_operations import Mask
-from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, follow_both_ways, gray_for_flow
+from ...footage.keypoints import follow_both_ways
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...footage.alignment import align
-from ...footage.keypoints import keypoints
-from ...footage.optical_flow import fixed_in_image, follow_both_ways
+from ...footage.keypoints import follow_both_ways, keypoints
+from ...footage.optical_flow import fixed_in_image
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
 from .tracks import PoseInput, TrackingCamera

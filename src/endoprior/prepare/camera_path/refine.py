@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...footage.optical_flow import follow_and_return
+from ...footage.keypoints import follow_and_return
 from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
 from .adjust import Adjusted, Observations, adjust, back_projected, residuals
