@@ -16,11 +16,10 @@ from ..core.config import DataConfig
 from ..core.ranges import evenly_spaced
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
-from ..data.contents import overexposed
 from ..data.formats import needs_depth
 from ..data.found_tools import UNCERTAIN, read_rows
 from ..data.mask_files import Polarity
-from ..data.pixels import measured_share
+from ..data.pixels import measured_share, overexposed
 from ..data.scale import Scale
 from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Outline, Strips, find_outline, masked_border

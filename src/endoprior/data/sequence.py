@@ -20,9 +20,11 @@ from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
-from .contents import demand_same, demand_trainable, fingerprint_of, frame_contents, state_of, weighted
 from .description import ESTIMATED_POSES, TOOLS_FOUND
+from .files import demand_same, fingerprint_of, state_of
+from .pixels import weighted
 from .scale import Scale
+from .trainable import demand_trainable, frame_contents
 from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]

@@ -32,8 +32,8 @@ Values = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Look:
-    """What is known of one frame alone."""
+class FramePrediction:
+    """What the network predicts of one frame alone."""
 
     rgb_u8: Image  # (h, w, 3)
     log_odds: Values  # (h, w) of a tool
@@ -47,11 +47,11 @@ class SmallTools:
     log_odds: Values  # (h, w) carried over time
 
 
-def decide_over_time(looks: Iterable[Look], view: Mask) -> Iterator[SmallTools]:
+def decide_over_time(predictions: Iterable[FramePrediction], view: Mask) -> Iterator[SmallTools]:
     """The tools of each frame of a clip, in order. Args: view: (h, w) True inside the endoscope's image."""
-    waiting, first = list[Look](), 0  # `first` of them are decided and kept as a margin
-    for look in looks:
-        waiting.append(look)
+    waiting, first = list[FramePrediction](), 0  # `first` of them are decided and kept as a margin
+    for prediction in predictions:
+        waiting.append(prediction)
         if len(waiting) == first + CHUNK + MARGIN:
             yield from _decided(waiting, view)[first : first + CHUNK]
             gone = max(first + CHUNK - MARGIN, 0)
@@ -60,9 +60,9 @@ def decide_over_time(looks: Iterable[Look], view: Mask) -> Iterator[SmallTools]:
         yield from _decided(waiting, view)[first:]
 
 
-def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
-    links = [BidirectionalFlow.between(before, after) for before, after in pairwise(looks)]
-    odds = carried([np.clip(look.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS) for look in looks], links)
+def _decided(predictions: list[FramePrediction], view: Mask) -> list[SmallTools]:
+    links = [BidirectionalFlow.between(before, after) for before, after in pairwise(predictions)]
+    odds = carried([np.clip(each.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS) for each in predictions], links)
     regions = [candidate_regions(each, view) for each in odds]
     taken = [np.any([np.zeros_like(view), *(r.mask for r in found if r.is_tool)], axis=0) for found in regions]
     agreed = carried([mask.astype(np.float32) for mask in taken], links, MIN_TRUST)
@@ -82,12 +82,12 @@ class BidirectionalFlow:
     trust_before: Values
 
     @classmethod
-    def between(cls, before: Look, after: Look) -> BidirectionalFlow:
+    def between(cls, before: FramePrediction, after: FramePrediction) -> BidirectionalFlow:
         shape = before.log_odds.shape
         grid = np.dstack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1])))
         onward = back = np.zeros_like(grid)
         if min(shape) >= MIN_SIZE_PX:
-            grays = (cv2.cvtColor(look.rgb_u8, cv2.COLOR_RGB2GRAY) for look in (before, after))
+            grays = (cv2.cvtColor(each.rgb_u8, cv2.COLOR_RGB2GRAY) for each in (before, after))
             onward, back = flow_pair(*(np.asarray(gray, np.uint8) for gray in grays))
         colors = [cv2.GaussianBlur(each.rgb_u8.astype(np.float32), (0, 0), COLOR_BLUR_PX) for each in (before, after)]
 
