@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.geometry import length_unit, project, unit_vectors
+from ..core.types import frame_times
 from ..model.carry import CarriedPoints, carry
 from ..model.measures import SurfaceMotion, distance, measures_of
 from ..model.scene import Scene
@@ -43,7 +44,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     """
     num_frames, rate, unit = len(scene.cameras), scene.frames_per_second, length_unit(scene.lengths_are_relative)
     since, until = _frames(options, num_frames)
-    times, camera = [i / num_frames for i in range(num_frames)], scene.cameras[since]
+    times, camera = frame_times(num_frames), scene.cameras[since]
     surface = render_surface(scene, times[since], camera, options.min_alpha)
     mesh = depth_grid(surface, options.mesh_step, options.max_slope)
     if not len(mesh.triangles):

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.types import Frame
+from ..core.types import Frame, to_uint8
 from ..model.photometric import GRID
 from ..system.memory import workers
 
@@ -172,7 +172,7 @@ def cleared(frame: Frame, grid: NDArray) -> Frame:
     """The frame without the smoke that its coefficients (I, J, 2) say: where Gaussians start."""
     gain, veil = of_pixels(grid, frame.tissue_mask.shape)
     color = np.sqrt(np.maximum(frame.rgb**2 - veil[..., None], 0) / gain[..., None])
-    return replace(frame, rgb_u8=(np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8))
+    return replace(frame, rgb_u8=to_uint8(color))
 
 
 @dataclass(frozen=True)
