@@ -21,7 +21,7 @@ from ..data.found_tools import UNCERTAIN, read_rows
 from ..data.mask_files import Polarity
 from ..data.pixels import measured_share, overexposed
 from ..data.scale import Scale
-from ..data.window_plan import look_through, plan_windows
+from ..data.window_plan import plan_windows, summarize_frames
 from ..footage.border import Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
@@ -214,7 +214,7 @@ def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool:
             lambda: (frame.rgb_u8 for frame in followed), lambda: map(masks.tissue, followed), pool.map
         ),
         motion_step=step,
-        windows=tuple(plan_windows(cameras, look_through(sequence), preset("default").windows.longest)),
+        windows=tuple(plan_windows(cameras, summarize_frames(sequence), preset("default").windows.longest)),
         pose_fit=measure_pose_fit(sequence, pool.map),
         changes=known.find_changes(lambda: (frame.rgb_u8 for frame in frames), pool.map),
         overexposed=np.array([_overexposed_share(frame) for frame in frames]),

@@ -23,7 +23,7 @@ from ...system.parallel import frame_threads
 from .adjust import Adjusted, Observations, adjust, back_projected, residuals
 from .path import CameraPath
 from .tracks import PoseInput, TrackingCamera
-from .views import EvenView, Warp, choose_partners, matrix_at, scaled_size
+from .views import HighPassImage, Warp, choose_partners, matrix_at, scaled_size
 
 MAX_WIDTH = 640  # frames are matched at this width at most, px
 PIXEL_STD = 0.3  # of a match, px of an image 640 px wide
@@ -223,7 +223,7 @@ def match_frames(
 
 
 def _picture(seen: PoseInput, size: tuple[int, int]) -> _Picture:
-    view = EvenView.of(seen.rgb_u8, seen.tissue_mask, size)
+    view = HighPassImage.of(seen.rgb_u8, seen.tissue_mask, size)
     std = float(view.detail[view.usable > 0].std()) if view.usable.any() else 1.0
     levels = np.clip(128 + 128 / (CONTRAST * max(std, 1e-6)) * view.detail, 0, 255).astype(np.uint8)
     depth = cv2.resize(seen.depth, size, interpolation=cv2.INTER_NEAREST)
