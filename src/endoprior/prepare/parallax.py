@@ -99,11 +99,8 @@ def measure_depth(
         return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (count, *shape))
 
     measured, scores = stored("inverse_depth", np.float32), stored("correlation", np.float16)
-    confidence, filled, factor = (
-        stored("confidence", np.uint8),
-        stored("depth", np.float32),
-        stored("factor", np.float32),
-    )
+    confidence, filled = stored("confidence", np.uint8), stored("depth", np.float32)
+    factor = stored("factor", np.float32)
     guesses, distance, tissue_px, shares = stored("guess", np.float32), *np.zeros((3, count))
     with frame_threads(BYTES_PER_PX * shape[0] * shape[1]) as pool:
         for i, found in zip(everything, pool.map(lambda i: _guessed(frame(i), small), everything), strict=True):

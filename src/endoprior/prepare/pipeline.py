@@ -298,11 +298,8 @@ def _use_parallax(
 
     def bend(index: int) -> tuple[int, NDArray[np.uint16], NDArray[np.uint8]]:
         guess = read_depth(files.file("depth", index), meta.depth_scale)
-        return (
-            index,
-            files.depth_units(found.depth(index, guess)),
-            found.resized_confidence(index, (meta.width, meta.height)),
-        )
+        confidence = found.resized_confidence(index, (meta.width, meta.height))
+        return index, files.depth_units(found.depth(index, guess)), confidence
 
     with frame_threads(BYTES_PER_PX * meta.width * meta.height) as pool:
         for index, units, confidence in pool.map(bend, range(files.count)):
