@@ -83,8 +83,8 @@ def test_a_resting_frame_is_averaged_by_powers_of_keep():
     rng = np.random.default_rng(1)
     values = [rng.normal(0, 1, (HEIGHT, WIDTH)).astype(np.float32) for _ in range(5)]
     predictions = [predicted(value) for value in values]
-    links = [over_time.BidirectionalFlow.between(*pair) for pair in pairwise(predictions)]
-    found = over_time.carried(values, links)
+    flows = [over_time.BidirectionalFlow.between(*pair) for pair in pairwise(predictions)]
+    found = over_time.carried(values, flows)
     inner = np.s_[8:-8, 8:-8]
     for t, mean in enumerate(found):
         weights = KEEP ** np.abs(np.arange(5) - t)

@@ -32,7 +32,7 @@ from ..footage.overlays import without_strokes
 from ..footage.pose_fit import PoseFit
 from ..footage.round_border import Circle
 from ..footage.text_network import TextDetector
-from ..footage.texts import resting_rectangles
+from ..footage.texts import static_rectangles
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
 from ..system.parallel import Pool, frame_threads
@@ -279,7 +279,7 @@ def _border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: lis
         outline.outside,
         _mean(tissue[outline.outside]),
         outline.other.sharpness,
-        tuple(filter(is_label, resting_rectangles(images[::2], TextDetector().find))),
+        tuple(filter(is_label, static_rectangles(images[::2], TextDetector().find))),
         masked,
     )
 

@@ -43,7 +43,7 @@ def match_descriptors(
     return np.array([m.queryIdx for m in found], np.intp), np.array([m.trainIdx for m in found], np.intp)
 
 
-def follow_both_ways(
+def track_points(
     first: Image,
     second: Image,
     pixels: NDArray[np.float32],
@@ -58,15 +58,15 @@ def follow_both_ways(
 
     Args:
         max_error_px: largest forward-backward error of x and of y, px; above it a pixel counts as lost.
-        side_px, halvings, guess, criteria: as of `follow_and_return`.
+        side_px, halvings, guess, criteria: as of `track_forward_backward`.
     """
-    there, back, found = follow_and_return(
+    there, back, found = track_forward_backward(
         first, second, pixels, side_px=side_px, halvings=halvings, guess=guess, criteria=criteria
     )
     return there, found & (np.abs(back - pixels).max(1) < max_error_px)
 
 
-def follow_and_return(
+def track_forward_backward(
     first: Image,
     second: Image,
     pixels: NDArray[np.float32],

@@ -62,7 +62,7 @@ def find_text(
     found = confirm([in_view(frame.left) for frame in samples])
     boxes: dict[int, list[TextBox]] = {}
     notes = []
-    for text in found.resting:
+    for text in found.static:
         first, last = text.seen[0] - 1, text.seen[-1] + 1
         low = samples[first].index if first >= 0 else -1
         high = samples[last].index if last < len(samples) else math.inf

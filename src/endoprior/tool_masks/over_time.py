@@ -61,11 +61,11 @@ def decide_over_time(predictions: Iterable[FramePrediction], view: Mask) -> Iter
 
 
 def _decided(predictions: list[FramePrediction], view: Mask) -> list[SmallTools]:
-    links = [BidirectionalFlow.between(before, after) for before, after in pairwise(predictions)]
-    odds = carried([np.clip(each.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS) for each in predictions], links)
+    flows = [BidirectionalFlow.between(before, after) for before, after in pairwise(predictions)]
+    odds = carried([np.clip(each.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS) for each in predictions], flows)
     regions = [candidate_regions(each, view) for each in odds]
     taken = [np.any([np.zeros_like(view), *(r.mask for r in found if r.is_tool)], axis=0) for found in regions]
-    agreed = carried([mask.astype(np.float32) for mask in taken], links, MIN_TRUST)
+    agreed = carried([mask.astype(np.float32) for mask in taken], flows, MIN_TRUST)
     return [
         SmallTools(joined([r.mask for r in found if share[r.mask].mean() > AGREED], each, view), each)
         for found, share, each in zip(regions, agreed, odds, strict=True)
@@ -100,14 +100,14 @@ class BidirectionalFlow:
         return cls(grid + back, grid + onward, behind, ahead)
 
 
-def carried(values: list[Values], links: list[BidirectionalFlow], least_trust: float = 0.0) -> list[Values]:
+def carried(values: list[Values], flows: list[BidirectionalFlow], least_trust: float = 0.0) -> list[Values]:
     """(h, w) weighted mean of each frame's values and those of the frames around, carried along the flow."""
 
     def step(places: NDArray[np.float32], trust: Values) -> tuple[NDArray[np.float32], Values]:
         return places, least_trust + (1 - least_trust) * trust
 
-    ahead = _one_way(values, [step(link.to_before, link.trust_after) for link in links])
-    behind = _one_way(values[::-1], [step(link.to_after, link.trust_before) for link in links[::-1]])[::-1]
+    ahead = _one_way(values, [step(flow.to_before, flow.trust_after) for flow in flows])
+    behind = _one_way(values[::-1], [step(flow.to_after, flow.trust_before) for flow in flows[::-1]])[::-1]
     # Both sums hold the frame itself.
     return [
         ((a[..., 0] + b[..., 0] - own) / (a[..., 1] + b[..., 1] - 1)).astype(np.float32)
