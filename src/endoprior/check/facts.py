@@ -27,7 +27,6 @@ from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
 from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.known_facts import KnownFacts
-from ..footage.masked_tissue import MaskedTissue, find_masked_tissue
 from ..footage.overlays import without_strokes
 from ..footage.pose_fit import PoseFit
 from ..footage.round_border import Circle
@@ -37,6 +36,7 @@ from ..initialization.sampling import initial_points
 from ..model.presets import preset
 from ..system.parallel import Pool, frame_threads
 from .finding import About, about_sequence
+from .masked_tissue import MaskedTissue, find_masked_tissue
 from .samples import (
     StereoFacts,
     are_inverted,
