@@ -40,11 +40,11 @@ def shares(trainer: GaussianTrainer) -> dict[str, float]:
     # The compiled loss differentiates its terms together.
     apart = replace(trainer.ops, supervised_losses=losses.supervised_losses)
     step, state = replace(trainer.step_once, ops=apart), trainer.state
-    drawn = step.draw(state, np.random.default_rng([trainer.cfg.seed, int(state.stage), state.iteration + 1]))
+    forward = step.forward(state, np.random.default_rng([trainer.cfg.seed, int(state.stage), state.iteration + 1]))
     norms = {}
-    for name, term in step.loss(state, drawn)[0].items():
+    for name, term in step.loss(state, forward)[0].items():
         if term.requires_grad:
-            (gradient,) = torch.autograd.grad(term, drawn.splats.means, retain_graph=True, allow_unused=True)
+            (gradient,) = torch.autograd.grad(term, forward.splats.means, retain_graph=True, allow_unused=True)
             norms[name] = 0.0 if gradient is None else float(gradient.norm())
     return {name: norm / norms["color"] for name, norm in norms.items()}
 

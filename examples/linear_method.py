@@ -9,7 +9,7 @@ from endoprior.model.presets import paper
 from endoprior.training.gaussian_method import GaussianMethod
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 
 
 class LinearMotion(Motion):
@@ -45,9 +45,9 @@ class LinearMethod(GaussianMethod):
             return lambda iteration: 1e-2
         return super().rate(name, cfg, spatial_scale)
 
-    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
-        pull = 1e-4 * drawn.gaussians["velocities"].square().mean()
-        return super().terms(drawn, cfg, ops) | {"pull": pull}
+    def terms(self, forward: ForwardPass, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+        pull = 1e-4 * forward.gaussians["velocities"].square().mean()
+        return super().terms(forward, cfg, ops) | {"pull": pull}
 
 
 METHOD = LinearMethod()

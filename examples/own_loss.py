@@ -10,7 +10,7 @@ from endoprior.core.config import Config
 from endoprior.core.ranges import Range
 from endoprior.training.ops import TrainingOps
 from endoprior.training.own_method import OwnMethod
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 
 AREA_PX = 8
 
@@ -23,10 +23,10 @@ class OwnLossConfig(Config):
     areas_weight: Annotated[float, Range(0, 1e9)] = 0.5
 
 
-def areas(drawn: Drawn) -> Tensor:
+def areas(forward: ForwardPass) -> Tensor:
     """Absolute difference of mean colors over squares of tissue, ()."""
-    frame = drawn.frame
-    error = (drawn.out.color - frame.rgb) * frame.counted(frame.tissue_mask)[..., None]
+    frame = forward.frame
+    error = (forward.out.color - frame.rgb) * frame.counted(frame.tissue_mask)[..., None]
     return avg_pool2d(error.permute(2, 0, 1), AREA_PX).abs().mean()
 
 
@@ -35,9 +35,9 @@ class OwnLoss(OwnMethod):
 
     config_type = OwnLossConfig
 
-    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+    def terms(self, forward: ForwardPass, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         assert isinstance(cfg, OwnLossConfig)
-        return super().terms(drawn, cfg, ops) | {"areas": cfg.areas_weight * areas(drawn)}
+        return super().terms(forward, cfg, ops) | {"areas": cfg.areas_weight * areas(forward)}
 
 
 METHOD = OwnLoss()

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from endoprior.footage.border import Circle, find_circle, find_strips
+from endoprior.footage.border import find_strips
+from endoprior.footage.round_border import Circle, find_circle
 
 WIDTH, HEIGHT, COUNT = 320, 240, 10
 

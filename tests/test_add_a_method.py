@@ -147,7 +147,7 @@ def _stop_at(iteration: int, last: int) -> None:
             r"init\.motion: expected rest .* got flow\. Fix: Set .*own_method\.Own",
         ),
         ((".abs().mean()", ".abs()"), r"loss term areas: expected .* got shape \(3, \d+, \d+\)\. Fix: Return its mean"),
-        (("cfg.areas_weight * areas(drawn)", "0.0"), r"loss term areas: expected .* got a float\. Fix: "),
+        (("cfg.areas_weight * areas(forward)", "0.0"), r"loss term areas: expected .* got a float\. Fix: "),
         (('{"areas"', '{"track"'), r"loss term track: expected a name of its own.* Fix: Rename it\."),
     ],
 )

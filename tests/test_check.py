@@ -20,8 +20,8 @@ from endoprior.cli import main
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.found_tools import FrameRow, write_rows
-from endoprior.footage.border import Circle
 from endoprior.footage.depth_unit import guess_unit
+from endoprior.footage.round_border import Circle
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.view.mask_editor import MaskEdits
 

@@ -16,7 +16,7 @@ from endoprior.training.adam import adam_step_numba as adam_step
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 from endoprior_baselines.deform3dgs import METHOD, first_points
 from endoprior_baselines.learned_basis import COEFFICIENTS, value_at
@@ -179,8 +179,8 @@ def test_the_loss_by_hand(tiny_sequence):
         radii=torch.zeros(1, dtype=torch.int32),
     )
     for ops in (NUMBA, TORCH):
-        drawn = Drawn(Stage.FINE, 1, 0, frame, None, None, None, None, out, None, None)
-        terms = METHOD.terms(drawn, preset("deform3dgs"), ops)
+        forward = ForwardPass(Stage.FINE, 1, 0, frame, None, None, None, None, out, None, None)
+        terms = METHOD.terms(forward, preset("deform3dgs"), ops)
         values = {name: float(value) for name, value in terms.items()}
         assert values["color"] == pytest.approx(0.25, rel=1e-4) and values["depth"] == pytest.approx(0.125, rel=1e-3)
         assert values["tv"] == 0 and values["edges"] == 0

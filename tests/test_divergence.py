@@ -99,9 +99,9 @@ def test_every_method_is_watched_by_its_error_on_tissue(tiny_sequence, name, mon
         deformation=replace(cfg.deformation, hexplane=small),
     )
     trainer = started(tiny_sequence, cfg)
-    drawn = trainer.step_once.draw(trainer.state, np.random.default_rng(0))
-    expected = float(color_l1(drawn.out.color.detach(), drawn.frame.rgb, drawn.frame.tissue_mask))
-    _, error = trainer.step_once.loss(trainer.state, drawn)
+    forward = trainer.step_once.forward(trainer.state, np.random.default_rng(0))
+    expected = float(color_l1(forward.out.color.detach(), forward.frame.rgb, forward.frame.tissue_mask))
+    _, error = trainer.step_once.loss(trainer.state, forward)
     assert float(error.detach()) == pytest.approx(expected, rel=1e-5)
     with torch.no_grad():
         trainer.state.gaussians["opacity_logits"].fill_(-40)

@@ -19,7 +19,7 @@ from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 from endoprior_baselines.endo4dgs import (
     METHOD,
@@ -127,8 +127,8 @@ def test_the_loss_by_hand(tiny_sequence):
     ones = torch.ones_like(frame.depth)
     out = RenderOutput(frame.rgb + 0.1, ones, 2 * frame.depth, torch.zeros(1, 2), torch.zeros(1))
     gray = create_gaussians(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), CFG).splats(None, 0)
-    drawn = Drawn(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
-    terms = {name: float(value.detach()) for name, value in METHOD.terms(drawn, CFG, NUMBA).items()}
+    forward = ForwardPass(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
+    terms = {name: float(value.detach()) for name, value in METHOD.terms(forward, CFG, NUMBA).items()}
     assert terms["color"] == pytest.approx(0.1 * float(frame.tissue_mask.float().mean()), rel=1e-4)
     assert terms["depth"] == pytest.approx(0, abs=1e-6) and terms["gradient"] == pytest.approx(0, abs=1e-6)
     assert terms["confidence"] == pytest.approx(0.001 * (0.01 / 2), rel=1e-3)  # c = 1: MSE / 2, for color alone
@@ -140,8 +140,8 @@ def test_depth_is_divided_by_alpha_and_confidence_trains_nothing(tiny_sequence):
     alpha = torch.linspace(0.2, 0.9, frame.depth.numel()).reshape(frame.depth.shape).requires_grad_()
     out = RenderOutput(frame.rgb + 0.1, alpha, alpha.detach() * frame.depth, torch.zeros(1, 2), torch.zeros(1))
     gray = create_gaussians(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), CFG).splats(None, 0)
-    drawn = Drawn(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
-    terms = METHOD.terms(drawn, CFG, NUMBA)
+    forward = ForwardPass(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
+    terms = METHOD.terms(forward, CFG, NUMBA)
     assert float(terms["depth"].detach()) == pytest.approx(0, abs=1e-6)
     (1e6 * terms["confidence"]).backward()
     assert float(alpha.grad.abs().max()) < 0.1, "only by the depth, which fits: not by the confidence"
@@ -155,8 +155,8 @@ def test_a_frame_without_tissue_has_finite_terms_and_gradients(tiny_sequence):
     color, depth = frame.rgb.requires_grad_(), frame.depth.requires_grad_()
     out = RenderOutput(color, torch.ones_like(depth), depth, torch.zeros(1, 2), torch.zeros(1))
     gray = create_gaussians(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), CFG).splats(None, 0)
-    drawn = Drawn(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
-    terms = METHOD.terms(drawn, CFG, NUMBA)
+    forward = ForwardPass(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
+    terms = METHOD.terms(forward, CFG, NUMBA)
     sum(terms.values()).backward()
     assert all(bool(value.isfinite()) for value in terms.values())
     assert color.grad.isfinite().all() and depth.grad.isfinite().all()

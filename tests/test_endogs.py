@@ -20,7 +20,7 @@ from endoprior.training.frames import TrainingFrames
 from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 from endoprior_baselines.endogs import METHOD, JointField, depth_huber
 from endoprior_baselines.plane_terms import PlaneWeights, plane_term
@@ -118,8 +118,8 @@ def test_the_loss_by_hand(tiny_sequence):
     frame = frames.frame(0)
     depth = frame.depth
     out = RenderOutput(frame.rgb + 0.1, torch.ones_like(depth), 2 * depth, torch.zeros(1, 2), torch.zeros(1))
-    drawn = Drawn(Stage.COARSE, 1, 0, frame, None, None, None, None, out, None, weight)
-    terms = METHOD.terms(drawn, CFG, NUMBA)
+    forward = ForwardPass(Stage.COARSE, 1, 0, frame, None, None, None, None, out, None, weight)
+    terms = METHOD.terms(forward, CFG, NUMBA)
     assert float(terms["color"]) == pytest.approx(0.1 * float((weight * frame.tissue_mask).mean()), rel=1e-4)
     outside = out.color * ~frame.tissue_mask[..., None]
     steps = (outside[1:] - outside[:-1]).abs().sum() + (outside[:, 1:] - outside[:, :-1]).abs().sum()
@@ -131,8 +131,8 @@ def test_at_half_resolution_a_pixel_has_the_mean_weight_of_its_block(tiny_sequen
     frames = TrainingFrames(load_sequence(tiny_sequence))
     weight, frame = METHOD.context(frames, CFG), frames.frame(0, half=True)
     out = RenderOutput(frame.rgb + 0.1, torch.ones(20, 24), frame.depth, torch.zeros(1, 2), torch.zeros(1))
-    drawn = Drawn(Stage.FINE, 1, 0, frame, None, random_field(), None, None, out, None, weight)
-    terms = METHOD.terms(drawn, CFG, NUMBA)
+    forward = ForwardPass(Stage.FINE, 1, 0, frame, None, random_field(), None, None, out, None, weight)
+    terms = METHOD.terms(forward, CFG, NUMBA)
     blocks = weight.reshape(20, 2, 24, 2).mean((1, 3))
     assert float(terms["color"]) == pytest.approx(0.1 * float((blocks * frame.tissue_mask).mean()), rel=1e-4)
 
@@ -149,8 +149,8 @@ def test_planes_are_regularized_whether_or_not_the_box_is_learned(tiny_sequence)
     for learns_box in (True, False):
         field = random_field()
         field.box.requires_grad_(learns_box)
-        drawn = Drawn(Stage.FINE, 1, 0, frame, None, field, None, None, out, None, torch.ones(40, 48))
-        METHOD.terms(drawn, CFG, NUMBA)["planes"].backward()
+        forward = ForwardPass(Stage.FINE, 1, 0, frame, None, field, None, None, out, None, torch.ones(40, 48))
+        METHOD.terms(forward, CFG, NUMBA)["planes"].backward()
         assert field.grid.grads.any(), learns_box
 
 

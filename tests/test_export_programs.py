@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from export_scenes import export, moving_run
 
+from endoprior.core.types import frame_times
 from endoprior.export.axes import points_in_axes
 from endoprior.export.mesh import Mesh, depth_grid
 from endoprior.model.carry import carry_points
@@ -30,7 +31,7 @@ def expected(run) -> tuple[Mesh, np.ndarray]:
     """The mesh of the first frame, and its (T, V, 3) vertices in all ten; world axes, mm."""
     scene = load_scene(run)
     mesh = depth_grid(render_surface(scene, 0.0, scene.cameras[0], 0.5), STEP, 5.0)
-    times = [i / len(scene.cameras) for i in range(len(scene.cameras))]
+    times = frame_times(len(scene.cameras))
     return mesh, carry_points(scene, mesh.vertices, np.zeros(len(mesh.vertices), np.intp), times)
 
 

@@ -22,7 +22,7 @@ from endoprior.core.config_io import to_dict
 from endoprior.data import load_sequence
 from endoprior.data.formats import REGISTRY
 from endoprior.data.images import save_png
-from endoprior.data.window_plan import look_through
+from endoprior.data.window_plan import summarize_frames
 from endoprior.export.time_steps import frame_indices
 from endoprior.runs.log import Growth
 from endoprior_studies.matched_count import search_thresholds
@@ -81,7 +81,7 @@ def test_a_phase_without_a_test_frame(make_tiny_sequence):
 
 def test_windows_are_planned_without_the_first_frame_where_it_is_held_out(tiny_sequence):
     """It counts as the first training frame: a black picture would begin a new window at frame 1."""
-    seen = look_through(load_sequence(tiny_sequence, DataConfig(test_phase=7)).training_view())
+    seen = summarize_frames(load_sequence(tiny_sequence, DataConfig(test_phase=7)).training_view())
     np.testing.assert_array_equal(seen.thumbnails[0], seen.thumbnails[1])
     assert seen.thumbnails[0].any() and seen.depth_mm[0] == seen.depth_mm[1]
     assert seen.depth_mm[8] == seen.depth_mm[7] and np.isfinite(seen.depth_mm).all()

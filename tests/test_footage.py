@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.footage.border import Circle, Strips, find_circle, find_strips
+from endoprior.footage.border import Strips, find_strips
 from endoprior.footage.camera_motion import camera_motion
+from endoprior.footage.round_border import Circle, find_circle
 
 
 def tissue(count=6, height=120, width=160, seed=0):

@@ -10,7 +10,7 @@ from tiny_training import tiny_config
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.data.writer import note_found_masks
+from endoprior.data.edit import note_found_masks
 from endoprior.runs.folder import CONFIG, LOG, check_state, load_checkpoint, save_checkpoint
 from endoprior.runs.log import missed_tools_line, missed_tools_of
 from endoprior.runs.train import train

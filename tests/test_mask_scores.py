@@ -30,7 +30,7 @@ from endoprior.evaluation.true_masks import (
     scores_of,
     tips,
 )
-from endoprior.footage.border import Circle
+from endoprior.footage.round_border import Circle
 
 SHAPE = (240, 320)  # a diagonal of 400 px: outlines agree within exactly 3 px
 ALL = np.ones(SHAPE, bool)

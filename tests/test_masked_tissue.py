@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.footage.masked_tissue import find_masked_tissue
+from endoprior.check.masked_tissue import find_masked_tissue
 
 HEIGHT, WIDTH, COUNT, RATE = 160, 200, 40, 25.0
 STEP_PX = 1.5  # of the tissue, a frame

@@ -11,8 +11,8 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
+from endoprior.data.edit import replace_masks, writable_masks
 from endoprior.data.images import read_tool_mask
-from endoprior.data.writer import replace_masks, writable_masks
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.visualization.image_tools import mask_sheet
 
@@ -105,7 +105,7 @@ def test_a_dataset_whose_reader_takes_no_masks_of_this_size_stays_as_it_is(tmp_p
     camera = sequence.camera(0)
     with pytest.raises(InputError, match="one mask file per frame"):
         replace_masks(sequence, dict.fromkeys(range(3), np.zeros((camera.height, camera.width), bool)))
-    search = "endoprior.tool_masks.mask_store.find_in_sequence"
+    search = "endoprior.tool_masks.tool_finder.find_in_sequence"
     monkeypatch.setattr(search, lambda *args, **more: pytest.fail("searched"))
     assert main(["masks", str(tmp_path / "DATA")]) == 2
     assert "one mask file per frame" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from endoprior.evaluation.context import to_uint8
+from endoprior.core.types import to_uint8
 from endoprior.evaluation.score import mean_over_frames
 from endoprior.evaluation.scorers.depth import depth_instability, depth_rmse, depth_rmse_8bit
 from endoprior.evaluation.scorers.image import (

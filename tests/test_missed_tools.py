@@ -13,8 +13,8 @@ from tiny_training import tiny_config
 
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.data import load_sequence
+from endoprior.data.edit import note_found_masks
 from endoprior.data.images import read_tool_mask, save_png
-from endoprior.data.writer import note_found_masks
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.missed_tools import MissedToolFinder, missed_tools

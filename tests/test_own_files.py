@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
+from endoprior.data.edit import write_scale
 from endoprior.data.found_tools import FrameRow
 from endoprior.data.scale import Scale
-from endoprior.data.scale_files import write_scale
 from endoprior.evaluation.context import read_frame_scores, read_scores
 from endoprior.runs.log import growth_of, read_log
 from endoprior.system.atomic import read_json_object

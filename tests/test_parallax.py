@@ -23,7 +23,7 @@ from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.camera_path.views import (
     MAX_DEGREES,
     MIN_DEGREES,
-    EvenView,
+    HighPassImage,
     Warp,
     choose_partners,
     matrix_at,
@@ -127,19 +127,19 @@ def test_correlation_bears_changes_of_light_and_leaves_out_what_is_not_seen():
     detail = cv2.GaussianBlur(rng.normal(size=(40, 50)).astype(np.float32), (0, 0), 1.5)
     seen, other = np.ones_like(detail), rng.normal(size=detail.shape).astype(np.float32)
     inner = np.s_[5:-5, 5:-5]
-    assert alike(EvenView(detail, seen), EvenView(3 * detail + 0.2, seen))[inner].min() > 0.97
-    assert alike(EvenView(detail, seen), EvenView(-detail, seen))[inner].max() < -0.9
-    assert abs(alike(EvenView(detail, seen), EvenView(other, seen), window_px=9)[inner].mean()) < 0.1
+    assert alike(HighPassImage(detail, seen), HighPassImage(3 * detail + 0.2, seen))[inner].min() > 0.97
+    assert alike(HighPassImage(detail, seen), HighPassImage(-detail, seen))[inner].max() < -0.9
+    assert abs(alike(HighPassImage(detail, seen), HighPassImage(other, seen), window_px=9)[inner].mean()) < 0.1
     hidden = seen.copy()
     hidden[:, 25:] = 0
-    found = alike(EvenView(detail, seen), EvenView(detail, hidden))
+    found = alike(HighPassImage(detail, seen), HighPassImage(detail, hidden))
     assert (found[5:-5, 30:] == -1).all() and found[5:-5, 5:20].min() > 0.97
 
 
 def test_correlation_is_that_of_a_slow_loop():
     rng = np.random.default_rng(1)
     (a, b), (u, v) = rng.normal(size=(2, 20, 24)).astype(np.float32), (rng.random((2, 20, 24)) > 0.2)
-    found = alike(EvenView(a * u, u.astype(np.float32)), EvenView(b * v, v.astype(np.float32)), window_px=5)
+    found = alike(HighPassImage(a * u, u.astype(np.float32)), HighPassImage(b * v, v.astype(np.float32)), window_px=5)
     for y in range(20):
         for x in range(24):
             window = np.s_[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
@@ -151,7 +151,7 @@ def test_correlation_is_that_of_a_slow_loop():
 def test_of_the_partners_the_better_half_counts():
     rng = np.random.default_rng(2)
     detail, seen = rng.normal(size=(5, 12, 12)).astype(np.float32), np.ones((12, 12), np.float32)
-    views = [EvenView(each, seen) for each in detail]
+    views = [HighPassImage(each, seen) for each in detail]
     each = np.sort([alike(views[0], other) for other in views[1:]], 0)
     assert np.allclose(alike(*views), each[2:].mean(0), atol=1e-6)
     assert np.allclose(alike(*views[:4]), np.sort([alike(views[0], other) for other in views[1:4]], 0)[1:].mean(0))
@@ -160,7 +160,7 @@ def test_of_the_partners_the_better_half_counts():
 
 def test_correlation_looks_where_the_warp_points():
     wide = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(30, 60)).astype(np.float32), (0, 0), 1.5)
-    here, there = (EvenView(wide[:, k : k + 40].copy(), np.ones((30, 40), np.float32)) for k in (10, 5))
+    here, there = (HighPassImage(wide[:, k : k + 40].copy(), np.ones((30, 40), np.float32)) for k in (10, 5))
     rows, columns = np.indices((30, 40)).astype(np.float32)
     by_depth = Warp(np.stack([columns, rows, np.ones_like(rows)]), np.array([50, 0, 0], np.float32))  # 5 px at w = 0.1
     found = correlation(here, [there], [by_depth], np.float32(0.1), 7)
@@ -172,13 +172,13 @@ def test_a_view_has_no_shading_and_no_highlights():
     seen = view(path(1)[0])
     lit = np.linspace(0.35, 1.0, WIDTH)[None, :, None]
     plain, shaded = (
-        EvenView.of((seen.rgb_u8 * light).astype(np.uint8), seen.tissue_mask, SIZE) for light in (1.0, lit)
+        HighPassImage.of((seen.rgb_u8 * light).astype(np.uint8), seen.tissue_mask, SIZE) for light in (1.0, lit)
     )
     both = (plain.usable > 0) & (shaded.usable > 0)
     assert np.corrcoef(plain.detail[both], shaded.detail[both])[0, 1] > 0.95
     glossy = seen.rgb_u8.copy()
     glossy[40:50, 60:70] = 255
-    assert not EvenView.of(glossy, seen.tissue_mask, SIZE).usable[40:50, 60:70].any()
+    assert not HighPassImage.of(glossy, seen.tissue_mask, SIZE).usable[40:50, 60:70].any()
 
 
 def test_a_peak_lies_between_planes():
@@ -278,7 +278,7 @@ def test_a_relief_is_measured_from_a_known_path(tmp_path):
     frames = [view(each) for each in camera_to_world]
     found = measured(tmp_path, frames, np.linalg.inv(camera_to_world))
     assert found.doubt == "" and found.frames == 1 and found.share > 0.6
-    error, sure = errors(found, frames, 6), found.sureness(6, SIZE) / 255
+    error, sure = errors(found, frames, 6), found.resized_confidence(6, SIZE) / 255
     assert np.median(error) < 0.01 and np.median(error[sure > 0.5]) < 0.006
     assert np.median(np.abs(80 / frames[6].depth - 1)) > 0.03  # what the guess had
 
@@ -291,7 +291,7 @@ def test_what_moves_by_itself_is_not_sure(tmp_path):
         region = lambda x, y, shift=shift: np.where(((x - 8) ** 2 + y**2 < 18**2)[..., None], shift, 0.0)  # noqa: E731
         frames.append(view(each, move=region))
     found = measured(tmp_path, frames, np.linalg.inv(camera_to_world))
-    sure = found.sureness(6, SIZE) / 255
+    sure = found.resized_confidence(6, SIZE) / 255
     spot, _ = project(
         np.array([8.0, 0, 80]), Camera(WIDTH, HEIGHT, 150, 150, 80, 60, np.linalg.inv(camera_to_world[6]))
     )
@@ -305,7 +305,7 @@ def test_what_is_burned_into_the_image_is_not_infinitely_far(tmp_path):
     for frame in frames:
         frame.rgb_u8[40:80, 50:110] = logo
     found = measured(tmp_path, frames, np.linalg.inv(camera_to_world))
-    assert found.sureness(6, SIZE)[48:72, 58:102].max() <= 1
+    assert found.resized_confidence(6, SIZE)[48:72, 58:102].max() <= 1
     assert np.median(errors(found, frames, 6)[48:72, 58:102]) < 0.1
 
 

@@ -18,7 +18,7 @@ from endoprior.core.checks import InputError
 from endoprior.model.photometric import GRID, add_smoke, add_smoke_torch, between, of_all_frames
 from endoprior.model.windowed_scene import Span, WindowedScene
 from endoprior.runs.train import start_run
-from endoprior.training.photometric import fitted_grids, looks_of, of_pixels, resized, smoke_needed, smoke_of
+from endoprior.training.photometric import fitted_grids, haze_statistics, of_pixels, resized, smoke_needed, smoke_of
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
@@ -132,15 +132,15 @@ def test_smoke_is_found_where_it_is_and_taken_away(smoky):
 
 def test_clear_frames_keep_the_brightness_of_the_tissue(smoky):
     small = [resized(frame) for frame in load_sequence(smoky[0]).frames("train")]
-    looks = looks_of(small)
-    grids = fitted_grids(small, looks)
-    clear = looks.haze < 0.05
+    statistics = haze_statistics(small)
+    grids = fitted_grids(small, statistics)
+    clear = statistics.haze < 0.05
     assert clear.sum() >= 3 and abs(np.log(grids[clear][..., 0]).mean()) < 0.02 and grids[clear][..., 1].max() < 0.02
 
 
 def test_clips_without_smoke_have_no_model(tiny_sequence):
     frames = load_sequence(tiny_sequence).frames("train")
-    assert not smoke_needed(looks_of([resized(frame) for frame in frames])) and smoke_of(frames, "auto") is None
+    assert not smoke_needed(haze_statistics([resized(frame) for frame in frames])) and smoke_of(frames, "auto") is None
     assert smoke_of(frames, "none") is None and smoke_of(frames, "smoke") is not None
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from endoprior.data.images import read_color, read_tool_mask
-from endoprior.footage.mask_polarity import mask_polarity
+from endoprior.data.mask_files import mask_polarity
 
 HEIGHT, WIDTH = 60, 80
 

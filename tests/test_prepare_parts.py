@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.footage.border import Circle, Strips
+from endoprior.footage.border import Strips
+from endoprior.footage.round_border import Circle
 from endoprior.prepare.calibration import Calibration, Intrinsics
 from endoprior.prepare.config import PrepareConfig, parse_rectangle
 from endoprior.prepare.frame_geometry import make_geometry

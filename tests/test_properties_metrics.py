@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.core.types import Camera, Frame
+from endoprior.core.types import Camera, Frame, to_uint8
 from endoprior.data.sequence import FrameSequence
-from endoprior.evaluation.context import EXACT, Evaluation, to_uint8
+from endoprior.evaluation.context import EXACT, Evaluation
 from endoprior.evaluation.score import mean_over_frames
 from endoprior.evaluation.scorers.depth import depth_instability, depth_rmse, depth_rmse_8bit
 from endoprior.evaluation.scorers.image import psnr, psnr_tissue, ssim, ssim_tissue

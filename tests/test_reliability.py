@@ -11,7 +11,7 @@ from tiny_training import losses_of, tiny_config
 
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence, shrunk
-from endoprior.data.contents import weighted
+from endoprior.data.pixels import weighted
 from endoprior.data.writer import FrameFiles, SequenceMeta
 from endoprior.initialization.sampling import initial_points, pixel_probability
 from endoprior.model.presets import preset

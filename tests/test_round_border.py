@@ -6,8 +6,8 @@ import painted_borders
 import pytest
 from painted_borders import HEIGHT, NOT_ROUND, ROUND, WIDTH, finish, judge, round_image, tissue
 
-from endoprior.footage.border import Circle, find_circle, find_outline, find_strips
-from endoprior.footage.dark_outline import fit_circle
+from endoprior.footage.border import find_outline, find_strips
+from endoprior.footage.round_border import Circle, find_circle, fit_circle
 from endoprior.prepare.first_pass import border_notes
 from endoprior.prepare.frame_geometry import make_geometry
 

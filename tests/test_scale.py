@@ -18,7 +18,8 @@ from endoprior.cli import main
 from endoprior.cli.view import open_viewable
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
-from endoprior.data import load_sequence, scale_files
+from endoprior.data import edit, load_sequence
+from endoprior.data.edit import finish_scale, write_scale
 from endoprior.data.images import save_png
 from endoprior.data.scale import (
     SHAPE_STD,
@@ -30,7 +31,6 @@ from endoprior.data.scale import (
     scale_between,
     scale_by_lengths,
 )
-from endoprior.data.scale_files import finish_scale, write_scale
 from endoprior.data.writer import FrameFiles, SequenceMeta, new_sequence
 from endoprior.prepare import prepare
 from endoprior.prepare.camera_path.path import CameraPath
@@ -149,7 +149,7 @@ def test_a_scale_is_replaced_and_never_multiplied(folder):
 
 @pytest.mark.parametrize("moved", range(4))
 def test_an_interrupted_scale_is_noticed_and_finished(folder, monkeypatch, capsys, moved):
-    calls, whole = [], scale_files.os.replace
+    calls, whole = [], edit.os.replace
 
     def replace(source, target):
         if "scale_pending" in str(source) and "partial" not in str(source):
@@ -160,10 +160,10 @@ def test_an_interrupted_scale_is_noticed_and_finished(folder, monkeypatch, capsy
 
     copy = shutil.copytree(folder, folder.with_name("COPY"))
     write_scale(copy, Scale(2.5, 0.07, "known length in frame 1"))
-    monkeypatch.setattr(scale_files.os, "replace", replace)
+    monkeypatch.setattr(edit.os, "replace", replace)
     with pytest.raises(KeyboardInterrupt):
         write_scale(folder, Scale(2.5, 0.07, "known length in frame 1"))
-    monkeypatch.setattr(scale_files.os, "replace", whole)
+    monkeypatch.setattr(edit.os, "replace", whole)
     with pytest.raises(InputError, match=r"a complete folder, got .* Fix: Finish it: `endoprior scale "):
         load_sequence(folder)
     assert main(["scale", str(folder)]) == 0 and "complete now" in capsys.readouterr().out

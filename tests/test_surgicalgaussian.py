@@ -18,7 +18,7 @@ from endoprior.model.presets import preset
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 from endoprior_baselines.released import grid_points
 from endoprior_baselines.surgicalgaussian import (
@@ -155,8 +155,8 @@ def test_the_loss_by_hand(tiny_sequence):
     frame = frames.frame(0)
     depth = frame.depth
     out = RenderOutput(frame.rgb + 0.1, torch.ones_like(depth), depth + 5, torch.zeros(1, 2), torch.zeros(1))
-    drawn = Drawn(Stage.COARSE, 1, 0, frame, gaussians_at(np.eye(3)), None, None, None, out, None, None)
-    terms = {name: float(value.detach()) for name, value in METHOD.terms(drawn, CFG, NUMBA).items()}
+    forward = ForwardPass(Stage.COARSE, 1, 0, frame, gaussians_at(np.eye(3)), None, None, None, out, None, None)
+    terms = {name: float(value.detach()) for name, value in METHOD.terms(forward, CFG, NUMBA).items()}
     assert terms["color"] == pytest.approx(0.8 * 0.1 * float(frame.tissue_mask.float().mean()), rel=1e-4)
     assert terms["depth"] == pytest.approx(0.001 * 5 * float(frame.measured.float().mean()) / 100, rel=1e-4)
     assert terms["ssim"] > 0 and terms["tv"] > 0 and set(terms) == {"color", "ssim", "tv", "depth"}

@@ -92,18 +92,18 @@ def test_tissue_has_no_text(find):
 
 def test_text_at_one_place_is_confirmed_and_a_single_box_is_not():
     once = [[at(50, 50)], *[[]] * 6]
-    assert confirm(once).resting == confirm(once).moving == []
-    assert confirm([[at(50, 50)]] * 2 + [[]] * 4).resting == []
-    (text,) = confirm([[], [at(50, 50)], [at(51, 50)], [at(30, 50, length=40)], []]).resting
+    assert confirm(once).static == confirm(once).moving == []
+    assert confirm([[at(50, 50)]] * 2 + [[]] * 4).static == []
+    (text,) = confirm([[], [at(50, 50)], [at(51, 50)], [at(30, 50, length=40)], []]).static
     assert text.seen == [1, 2, 3] and not confirm([[at(50, 50)]] * 3).moving
     assert rectangle(text.box, (100, 100)) == (10, 42, 81, 16), "from the first letter to the last one, and no higher"
 
 
 def test_slots_of_a_tool_that_drifts_are_no_text():
     drifting = [[at(50 + 2 * k, 50 + 5 * k, 60, 22, 22 + k, 0.9)] for k in range(6)]
-    assert confirm(drifting).resting == confirm(drifting).moving == []
+    assert confirm(drifting).static == confirm(drifting).moving == []
     weak = [[at(50, 50, score=0.8)]] * 4 + [[]] * 4
-    assert confirm(weak).resting == []
+    assert confirm(weak).static == []
 
 
 def test_text_that_moves_is_confirmed_by_its_size():
@@ -116,14 +116,14 @@ def test_text_that_moves_is_confirmed_by_its_size():
 
 def test_text_that_leaves_its_place_moves():
     rests = [[at(50, 40)]] * 6
-    assert confirm(rests).resting and not confirm(rests).moving
+    assert confirm(rests).static and not confirm(rests).moving
     jumps = [*rests, [at(150, 140)], [at(150, 40)]]
-    assert confirm(jumps).moving and not confirm(jumps).resting
+    assert confirm(jumps).moving and not confirm(jumps).static
     flickers = [[at(50, 40, score=0.99)], []] * 6
-    assert confirm(flickers).moving and not confirm(flickers).resting
-    assert confirm([[at(50, 40, score=0.9)], []] * 6).resting, "faint text may only be missed"
+    assert confirm(flickers).moving and not confirm(flickers).static
+    assert confirm([[at(50, 40, score=0.9)], []] * 6).static, "faint text may only be missed"
     two = [[at(50, 40), at(150, 140)]] * 6
-    assert len(confirm(two).resting) == 2 and not confirm(two).moving
+    assert len(confirm(two).static) == 2 and not confirm(two).moving
 
 
 def test_text_that_moves_is_followed_at_its_own_scale():
@@ -145,17 +145,17 @@ def test_a_name_at_rest_and_a_label_that_moves_over_tissue(find):
         named.append(written(frame)[0])
         labeled.append(written(frame, f"polyp: 0.9{k}", (20 + 14 * k, 40 + 16 * k)))
     ink = written(named[0])[1]
-    (name,) = confirm([find(image) for image in named]).resting
+    (name,) = confirm([find(image) for image in named]).static
     assert text_mask([name.box], ink.shape)[ink].mean() > 0.97
     images = [image for image, _ in labeled]
     texts = confirm([find(image) for image in images])
-    assert texts.moving and not texts.resting
+    assert texts.moving and not texts.static
     for boxes, (_, true) in zip(follow(images, texts.moving, find), labeled, strict=True):
         assert text_mask(boxes, true.shape)[true].mean() > 0.95
 
 
 def test_real_clip(find, real_clip):
     images = [read_color(real_clip / "images" / f"{i:06d}.png") for i in range(0, 90, 15)]
-    (text,) = confirm([find(image) for image in images]).resting  # the word "Left" in the corner
+    (text,) = confirm([find(image) for image in images]).static  # the word "Left" in the corner
     x, y, width, height = rectangle(text.box, images[0].shape)
     assert x < 20 and y < 10 and 50 < width < 120 and 25 < height < 60

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endoprior.tool_masks import over_time
-from endoprior.tool_masks.over_time import KEEP, MAX_LOG_ODDS, Look, decide_over_time
+from endoprior.tool_masks.over_time import KEEP, MAX_LOG_ODDS, FramePrediction, decide_over_time
 from endoprior.tool_masks.regions import candidate_regions, tool_regions
 
 HEIGHT, WIDTH = 96, 128
@@ -31,9 +31,9 @@ def odds(*parts):
     return out
 
 
-def look(log_odds, shift=0):
+def predicted(log_odds, shift=0):
     """Tissue that has moved to the left, px, and what the network says of it."""
-    return Look(np.clip(TISSUE[:, shift : shift + WIDTH], 0, 255).astype(np.uint8), log_odds)
+    return FramePrediction(np.clip(TISSUE[:, shift : shift + WIDTH], 0, 255).astype(np.uint8), log_odds)
 
 
 def iou(a, b):
@@ -82,9 +82,9 @@ def test_nothing_is_found_beyond_the_view():
 def test_a_resting_frame_is_averaged_by_powers_of_keep():
     rng = np.random.default_rng(1)
     values = [rng.normal(0, 1, (HEIGHT, WIDTH)).astype(np.float32) for _ in range(5)]
-    looks = [look(value) for value in values]
-    links = [over_time.BidirectionalFlow.between(*pair) for pair in pairwise(looks)]
-    found = over_time.carried(values, links)
+    predictions = [predicted(value) for value in values]
+    flows = [over_time.BidirectionalFlow.between(*pair) for pair in pairwise(predictions)]
+    found = over_time.carried(values, flows)
     inner = np.s_[8:-8, 8:-8]
     for t, mean in enumerate(found):
         weights = KEEP ** np.abs(np.arange(5) - t)
@@ -94,7 +94,7 @@ def test_a_resting_frame_is_averaged_by_powers_of_keep():
 
 def test_one_frame_alone_is_as_without_time():
     seen = odds((bar(), 5))
-    (alone,) = decide_over_time([look(seen)], VIEW)
+    (alone,) = decide_over_time([predicted(seen)], VIEW)
     assert (alone.tool_mask == tool_regions(seen, VIEW)).all()
     assert not list(decide_over_time([], VIEW))
 
@@ -104,42 +104,43 @@ def test_a_mask_that_goes_out_for_frames_or_merges_with_the_dark_stays(missed):
     """Seen before in a clip with smoke: 21 % of the picture, 0, 0, 15 %."""
     dark = (COLUMNS > 55) & (ROWS < 80)
     usual, bad = odds((bar(), 5)), odds((dark, 1.5), (bar(), 1.5)) if missed > 0 else odds((bar(), missed))
-    looks = [look(bad if t in (6, 7) else usual) for t in range(14)]
-    found = list(decide_over_time(looks, VIEW))
+    predictions = [predicted(bad if t in (6, 7) else usual) for t in range(14)]
+    found = list(decide_over_time(predictions, VIEW))
     assert all(iou(tools.tool_mask, bar()) > 0.7 for tools in found)
 
 
 def test_what_flares_up_in_one_frame_is_no_tool():
-    looks = [look(odds((bar(80, 100), 1.5 if t == 5 else -3))) for t in range(12)]
-    assert not any(tools.tool_mask.any() for tools in decide_over_time(looks, VIEW))
+    predictions = [predicted(odds((bar(80, 100), 1.5 if t == 5 else -3))) for t in range(12)]
+    assert not any(tools.tool_mask.any() for tools in decide_over_time(predictions, VIEW))
 
 
 def test_log_odds_move_with_the_image():
     """A tool that goes to the left by 2 px a frame with the image, and is missed in two frames."""
-    looks = [look(odds((bar(70 - 2 * t, 90 - 2 * t), -1 if t in (5, 6) else 5)), shift=2 * t) for t in range(12)]
-    for t, tools in enumerate(decide_over_time(looks, VIEW)):
-        assert iou(tools.tool_mask, bar(70 - 2 * t, 90 - 2 * t)) > 0.8, t
+    bars = [bar(70 - 2 * t, 90 - 2 * t) for t in range(12)]
+    predictions = [predicted(odds((bars[t], -1 if t in (5, 6) else 5)), shift=2 * t) for t in range(12)]
+    for t, tools in enumerate(decide_over_time(predictions, VIEW)):
+        assert iou(tools.tool_mask, bars[t]) > 0.8, t
 
 
 def test_nothing_is_carried_over_a_cut():
-    there = [look(odds((bar(), 5))) for _ in range(6)]
-    other = [Look(255 - each.rgb_u8, odds()) for each in there]
+    there = [predicted(odds((bar(), 5))) for _ in range(6)]
+    other = [FramePrediction(255 - each.rgb_u8, odds()) for each in there]
     found = list(decide_over_time([*there, *other], VIEW))
     assert all(tools.tool_mask.any() for tools in found[:6]) and not any(tools.tool_mask.any() for tools in found[6:])
 
 
 def test_a_long_clip_is_decided_in_chunks_that_know_their_neighbors(monkeypatch):
     rng = np.random.default_rng(2)
-    looks = [look(odds((bar(), float(rng.normal(1, 3))))) for _ in range(40)]
-    whole = [tools.tool_mask for tools in decide_over_time(looks, VIEW)]
+    predictions = [predicted(odds((bar(), float(rng.normal(1, 3))))) for _ in range(40)]
+    whole = [tools.tool_mask for tools in decide_over_time(predictions, VIEW)]
     monkeypatch.setattr(over_time, "CHUNK", 9)
     monkeypatch.setattr(over_time, "MARGIN", 12)
-    parts = [tools.tool_mask for tools in decide_over_time(looks, VIEW)]
+    parts = [tools.tool_mask for tools in decide_over_time(predictions, VIEW)]
     assert len(parts) == 40
     assert np.mean([iou(a, b) if a.any() or b.any() else 1 for a, b in zip(whole, parts, strict=True)]) > 0.95
 
 
 def test_sure_frames_do_not_outweigh_all_others():
-    looks = [look(odds((bar(), 1000.0 if t == 0 else -3.0))) for t in range(10)]
-    found = list(decide_over_time(looks, VIEW))
+    predictions = [predicted(odds((bar(), 1000.0 if t == 0 else -3.0))) for t in range(10)]
+    found = list(decide_over_time(predictions, VIEW))
     assert MAX_LOG_ODDS < 1000 and not any(tools.tool_mask.any() for tools in found[3:])

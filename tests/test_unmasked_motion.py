@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endoprior.data.found_tools import FILE, FrameRow, drop_rows, mark_moving, read_rows, write_rows
-from endoprior.footage.background_motion import difference_from_background
+from endoprior.footage.optical_flow import difference_from_background
 from endoprior.prepare.unmasked_motion import frames_with_unmasked_motion, moves_unmasked
 from endoprior.runs.log import missed_tools_line
 

@@ -20,7 +20,7 @@ from view_client import Client, at_work, wait_until
 
 from endoprior.cli.view import live_view, open_viewable
 from endoprior.core.config import Config
-from endoprior.core.types import Camera
+from endoprior.core.types import Camera, to_uint8
 from endoprior.data import load_sequence
 from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.gaussians import Gaussians
@@ -49,7 +49,6 @@ from endoprior.view.server import Viewer
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewable_sequence import ViewableSequence
-from endoprior.visualization.image_tools import to_u8
 
 NUM_FRAMES = 6
 CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
@@ -94,7 +93,7 @@ def close(a, b, levels: float = 3.0) -> bool:
 
 def test_the_image_equals_the_rendering_of_the_scene(scene):
     settings, viewable = ViewSettings(frame=3), ViewableScene(scene, "wall")
-    assert np.array_equal(viewable.picture(settings, CAMERA), to_u8(scene.render(3 / NUM_FRAMES).color.numpy()))
+    assert np.array_equal(viewable.picture(settings, CAMERA), to_uint8(scene.render(3 / NUM_FRAMES).color.numpy()))
     assert viewable.surface(settings, CAMERA)[24, 32] == pytest.approx(50, abs=1e-3)
 
 
@@ -103,12 +102,12 @@ def test_so_it_does_on_the_white_background_of_some_methods(scene, monkeypatch):
     monkeypatch.setattr(type(scene), "background", (1.0, 1.0, 1.0))
     white = scene.render(3 / NUM_FRAMES).color.numpy()
     assert np.abs(white - black).max() > 0.01, "two levels of 255 and more"
-    assert np.array_equal(ViewableScene(scene, "wall").picture(ViewSettings(frame=3), CAMERA), to_u8(white))
+    assert np.array_equal(ViewableScene(scene, "wall").picture(ViewSettings(frame=3), CAMERA), to_uint8(white))
 
 
 def test_the_slider_changes_the_image(viewer, client, scene):
     client.set(viewer.panel.frame, 5)
-    expected = to_u8(scene.render(5 / NUM_FRAMES).color.numpy())
+    expected = to_uint8(scene.render(5 / NUM_FRAMES).color.numpy())
     canvas = client.image()
     assert viewer.settings.frame == 5 and canvas.shape[:2] == (52, 64)  # 600 x 480 is narrower than 64 x 48
     assert np.array_equal(canvas[2:50], expected) and not canvas[0].any()

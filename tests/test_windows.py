@@ -15,7 +15,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence, window_plan
-from endoprior.data.window_plan import Looks, look_through, plan_windows
+from endoprior.data.window_plan import FrameSummaries, plan_windows, summarize_frames
 from endoprior.initialization.first_gaussians import create_gaussians
 from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.colors import with_fixed_color
@@ -57,11 +57,11 @@ def camera_at(turn_deg: float = 0.0, x_mm: float = 0.0) -> Camera:
     return Camera(64, 48, 80.0, 80.0, 32.0, 24.0, pose)
 
 
-def looks(num: int, change_from: int | None = None) -> Looks:
+def summaries(num: int, change_from: int | None = None) -> FrameSummaries:
     thumbnails = np.full((num, 2, 2, 3), 0.4, np.float32)
     if change_from is not None:
         thumbnails[change_from:] += 0.06
-    return Looks(thumbnails, np.full(num, 100.0))
+    return FrameSummaries(thumbnails, np.full(num, 100.0))
 
 
 def wall(start: int, stop: int, *, slides: bool = True) -> SingleScene:
@@ -96,14 +96,14 @@ def three() -> WindowedScene:
 @pytest.mark.parametrize(
     ("cameras", "seen", "starts"),
     [
-        ([camera_at() for _ in range(35)], looks(35), [0]),
-        ([camera_at(turn_deg=0.97 * i) for i in range(36)], looks(36), [0, 16]),
-        ([camera_at(turn_deg=2 * i) for i in range(36)], looks(36), [0, 10, 20]),
-        ([camera_at(x_mm=0.6 * i) for i in range(36)], looks(36), [0, 17]),
-        ([camera_at(x_mm=0.01 * i) for i in range(36)], looks(36, 12), [0, 12]),
-        ([camera_at() for _ in range(36)], looks(36, 12), [0]),
-        ([camera_at() for _ in range(100)], looks(100), [0, 36, 72]),
-        ([camera_at() for _ in range(44)], looks(44), [0, 34]),
+        ([camera_at() for _ in range(35)], summaries(35), [0]),
+        ([camera_at(turn_deg=0.97 * i) for i in range(36)], summaries(36), [0, 16]),
+        ([camera_at(turn_deg=2 * i) for i in range(36)], summaries(36), [0, 10, 20]),
+        ([camera_at(x_mm=0.6 * i) for i in range(36)], summaries(36), [0, 17]),
+        ([camera_at(x_mm=0.01 * i) for i in range(36)], summaries(36, 12), [0, 12]),
+        ([camera_at() for _ in range(36)], summaries(36, 12), [0]),
+        ([camera_at() for _ in range(100)], summaries(100), [0, 36, 72]),
+        ([camera_at() for _ in range(44)], summaries(44), [0, 34]),
     ],
     ids=[
         "short and still",
@@ -129,12 +129,12 @@ def test_where_a_sequence_is_cut(cameras, seen, starts, monkeypatch):
 
 def test_without_depth_only_turns_pictures_and_length_cut():
     cameras = [camera_at(x_mm=5.0 * i) for i in range(36)]
-    assert plan_windows(cameras, replace(looks(36), depth_mm=np.full(36, np.nan)), LONGEST) == [(0, 36)]
+    assert plan_windows(cameras, replace(summaries(36), depth_mm=np.full(36, np.nan)), LONGEST) == [(0, 36)]
 
 
 def test_held_out_frames_do_not_decide_where_to_cut(make_tiny_sequence):
     sequence = load_sequence(make_tiny_sequence(num_frames=12)).training_view()
-    seen = look_through(sequence)  # reading a held-out frame would raise
+    seen = summarize_frames(sequence)  # reading a held-out frame would raise
     assert (seen.thumbnails[9] == seen.thumbnails[8]).all() and (seen.thumbnails[8] != seen.thumbnails[7]).any()
 
 

@@ -26,7 +26,7 @@ from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import Rate, rate_of
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
@@ -89,13 +89,13 @@ class Endo4DGS(Released):
         return in_epochs(cfg.seed, stage, iteration, num_frames)
 
     @override
-    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
-        frame, out = drawn.frame, drawn.out
+    def terms(self, forward: ForwardPass, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+        frame, out = forward.frame, forward.out
         mask, color = frame.tissue_mask[..., None], out.color * frame.tissue_mask[..., None]
         z = out.depth / out.alpha.clamp(min=MIN_CONFIDENCE)
         known, valid = frame.depth, frame.measured & (z > 0)
         depth, target = without_scale(z, valid), without_scale(known, valid)
-        facing = (rendered_normals(drawn.splats, drawn.render) * normals_of_depth(known)).sum(-1)
+        facing = (rendered_normals(forward.splats, forward.render) * normals_of_depth(known)).sum(-1)
         trust = out.alpha.detach()
         picture = confident_error(out.color[frame.tissue_mask], frame.rgb[frame.tissue_mask], trust[frame.tissue_mask])
         surface = confident_error(depth[valid][:, None], target[valid][:, None], trust[valid])
@@ -106,9 +106,9 @@ class Endo4DGS(Released):
             "normal": NORMAL_WEIGHT * ((1 - facing) * frame.measured).abs().mean(),
             "confidence": CONFIDENCE_WEIGHT * picture + CONFIDENCE_WEIGHT * surface,
         }
-        if drawn.stage is Stage.FINE:
+        if forward.stage is Stage.FINE:
             terms["tv"] = TV_WEIGHT * (total_variation(color) + total_variation(z * frame.tissue_mask))
-        return terms | planes_of(drawn, PLANES)
+        return terms | planes_of(forward, PLANES)
 
     @override
     def plan(

@@ -30,7 +30,7 @@ from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import PLANES, Rate, log_linear, rate_of
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 
 from .plane_terms import PlaneWeights, planes_of
@@ -152,9 +152,9 @@ class EndoGS(Released):
         return 1 + OFTEN_HIDDEN * (hidden / norm if norm else hidden)
 
     @override
-    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
-        frame, out = drawn.frame, drawn.out
-        mask, weight = frame.tissue_mask[..., None], drawn.context
+    def terms(self, forward: ForwardPass, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+        frame, out = forward.frame, forward.out
+        mask, weight = frame.tissue_mask[..., None], forward.context
         if weight.shape != frame.tissue_mask.shape:  # at half resolution
             height, width = frame.tissue_mask.shape
             weight = adaptive_avg_pool2d(weight[None], (height, width))[0]
@@ -163,7 +163,7 @@ class EndoGS(Released):
             "depth": DEPTH_WEIGHT * depth_huber(out.depth, frame.depth, frame.measured),
             "tv": TV_WEIGHT * total_variation(out.color * ~mask),
         }
-        return terms | planes_of(drawn, PLANE_WEIGHTS)
+        return terms | planes_of(forward, PLANE_WEIGHTS)
 
     @override
     def plan(

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 from endoprior.compute.parallel_kernels import parallel_njit
 from endoprior.compute.simd import REORDERED
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 
 
@@ -49,12 +49,12 @@ def plane_term(grid: PlaneGrid, weights: PlaneWeights, anchor: Tensor) -> Tensor
     return _PlaneTerm.apply(anchor, grid, weights)
 
 
-def planes_of(drawn: Drawn, weights: PlaneWeights) -> dict[str, Tensor]:
+def planes_of(forward: ForwardPass, weights: PlaneWeights) -> dict[str, Tensor]:
     """`plane_term` by name, of the field that moved the Gaussians; nothing in the coarse stage."""
-    if drawn.stage is not Stage.FINE:
+    if forward.stage is not Stage.FINE:
         return {}
-    assert drawn.field is not None and drawn.field.grid is not None
-    return {"planes": plane_term(drawn.field.grid, weights, next(iter(drawn.field.parameters.values())))}
+    assert forward.field is not None and forward.field.grid is not None
+    return {"planes": plane_term(forward.field.grid, weights, next(iter(forward.field.parameters.values())))}
 
 
 class _PlaneTerm(torch.autograd.Function):

@@ -36,7 +36,7 @@ from endoprior.training.gaussian_hooks import in_epochs
 from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
 from endoprior.training.optimizer import FINAL_SHARE, NETWORK_LR, Rate, log_linear, rate_of
-from endoprior.training.state import Drawn
+from endoprior.training.state import ForwardPass
 from endoprior.training.trainer import Stage
 
 from .released import Released, grid_points
@@ -222,8 +222,8 @@ class SurgicalGaussian(Released):
         return lambda iteration: log_linear(NETWORK_LR, FINAL_SHARE * NETWORK_LR, iteration, steps)
 
     @override
-    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
-        frame, out, gaussians = drawn.frame, drawn.out, drawn.gaussians
+    def terms(self, forward: ForwardPass, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+        frame, out, gaussians = forward.frame, forward.out, forward.gaussians
         mask = frame.tissue_mask[..., None]
         color, target = out.color * mask, frame.rgb * mask
         terms = {
@@ -232,7 +232,7 @@ class SurgicalGaussian(Released):
             "tv": TV_WEIGHT * 2 * total_variation(out.color * ~mask),
             "depth": DEPTH_WEIGHT * ((out.depth - frame.depth) * frame.measured).abs().mean() / UNIT_MM,
         }
-        return terms if drawn.offsets is None else terms | neighbor_terms(gaussians, drawn.offsets, drawn.splats)
+        return terms if forward.offsets is None else terms | neighbor_terms(gaussians, forward.offsets, forward.splats)
 
     @override
     def plan(

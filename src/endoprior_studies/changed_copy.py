@@ -13,12 +13,13 @@ from endoprior.core.checks import InputError, input_error
 from endoprior.core.config import DataConfig
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.description import read_description
+from endoprior.data.edit import BACKUP, note_found_masks
+from endoprior.data.images import write_tool_mask
 from endoprior.data.poses import POSES
-from endoprior.data.writer import BACKUP, note_found_masks, write_mask
 from endoprior.evaluation.true_masks import SCORES_FILE, TrueMasks, score_masks
 from endoprior.prepare.folder_path import write_folder_path
 from endoprior.system.atomic import whole_folder, write_json
-from endoprior.tool_masks.mask_store import find_in_sequence
+from endoprior.tool_masks.tool_finder import find_in_sequence
 
 from .spec import SequenceSpec
 
@@ -103,7 +104,7 @@ def _put_found_masks(sequence: FrameSequence, copy: Path) -> None:
     for file, (mask, tools) in zip(sequence.mask_files, found, strict=True):
         place = copy / file.relative_to(sequence.path).as_posix()
         place.parent.mkdir(exist_ok=True)
-        write_mask(place, mask, sequence.mask_tool_value)
+        write_tool_mask(place, mask, sequence.mask_tool_value)
         with_tools += bool(tools.tool_mask.any())
     note_found_masks(copy, with_tools / len(sequence))
 

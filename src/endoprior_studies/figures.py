@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 
 from endoprior.core.config import DataConfig
 from endoprior.core.geometry import length_unit, project
-from endoprior.core.types import Camera, Frame, RenderedView
+from endoprior.core.types import Camera, Frame, RenderedView, to_uint8
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation.registry import all_scores
 from endoprior.model.scene import RenderedScene, Scene
 from endoprior.model.scene_file import load_scene
 from endoprior.priors import joint_texture_prior, specular_likelihood
 from endoprior.system.atomic import whole_file
-from endoprior.visualization.image_tools import colorize, label, tile, to_u8, write_png
+from endoprior.visualization.image_tools import colorize, label, tile, write_png
 from endoprior.visualization.rendered_views import tissue_distance, turned
 
 from .matrix import Matrix, frames_of
@@ -144,7 +144,7 @@ def frames_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> ND
     frame = test[len(test) // 2]
     windows = zoom_windows(frame)
     columns = {"input": frame.rgb_u8}
-    columns |= {name: to_u8(_rendered(scene, frame).color.numpy()) for name, scene in scenes.items()}
+    columns |= {name: to_uint8(_rendered(scene, frame).color.numpy()) for name, scene in scenes.items()}
     height, width = frame.tissue_mask.shape
     tiles = [_labeled(_outlined(image, windows), name) for name, image in columns.items()]
     for what, (rows, cols) in windows.items():
@@ -163,7 +163,7 @@ def sides_grid(sequence: FrameSequence, scenes: dict[str, RenderedScene]) -> NDA
         where = f"{abs(degrees):.0f} deg {'right' if degrees > 0 else 'left'}" if degrees else "endoscope"
         for name, scene in scenes.items():
             out = scene.render(frame.time, turned(_camera(scene, frame), degrees, distance))
-            tiles.append(_labeled(to_u8(out.color.numpy()), f"{name}, {where}"))
+            tiles.append(_labeled(to_uint8(out.color.numpy()), f"{name}, {where}"))
     return tile(tiles, len(scenes))
 
 

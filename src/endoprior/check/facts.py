@@ -16,27 +16,27 @@ from ..core.config import DataConfig
 from ..core.ranges import evenly_spaced
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
-from ..data.contents import overexposed
 from ..data.formats import needs_depth
 from ..data.found_tools import UNCERTAIN, read_rows
-from ..data.pixels import measured_share
+from ..data.mask_files import Polarity
+from ..data.pixels import measured_share, overexposed
 from ..data.scale import Scale
-from ..data.window_plan import look_through, plan_windows
-from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
+from ..data.window_plan import plan_windows, summarize_frames
+from ..footage.border import Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion
 from ..footage.changes import Changes
 from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.known_facts import KnownFacts
-from ..footage.mask_polarity import Polarity
-from ..footage.masked_tissue import MaskedTissue, find_masked_tissue
 from ..footage.overlays import without_strokes
 from ..footage.pose_fit import PoseFit
+from ..footage.round_border import Circle
 from ..footage.text_network import TextDetector
-from ..footage.texts import resting_rectangles
+from ..footage.texts import static_rectangles
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
 from ..system.parallel import Pool, frame_threads
 from .finding import About, about_sequence
+from .masked_tissue import MaskedTissue, find_masked_tissue
 from .samples import (
     StereoFacts,
     are_inverted,
@@ -214,7 +214,7 @@ def _measured(sequence: FrameSequence, cfg: DataConfig, known: KnownFacts, pool:
             lambda: (frame.rgb_u8 for frame in followed), lambda: map(masks.tissue, followed), pool.map
         ),
         motion_step=step,
-        windows=tuple(plan_windows(cameras, look_through(sequence), preset("default").windows.longest)),
+        windows=tuple(plan_windows(cameras, summarize_frames(sequence), preset("default").windows.longest)),
         pose_fit=measure_pose_fit(sequence, pool.map),
         changes=known.find_changes(lambda: (frame.rgb_u8 for frame in frames), pool.map),
         overexposed=np.array([_overexposed_share(frame) for frame in frames]),
@@ -279,7 +279,7 @@ def _border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: lis
         outline.outside,
         _mean(tissue[outline.outside]),
         outline.other.sharpness,
-        tuple(filter(is_label, resting_rectangles(images[::2], TextDetector().find))),
+        tuple(filter(is_label, static_rectangles(images[::2], TextDetector().find))),
         masked,
     )
 

@@ -17,11 +17,11 @@ from ..core.shell import command
 from ..data import FrameSequence
 from ..data.description import MOTION, SIZE_NOT_STATED
 from ..data.image_folders import ways_to_prepare
+from ..data.mask_files import Polarity
 from ..footage.camera_motion import MOVING_FRACTION
 from ..footage.changes import find_cuts
 from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.disturbances import DARK_MEAN_GRAY
-from ..footage.mask_polarity import Polarity
 from ..footage.pose_fit import PoseFit
 from ..footage.stereo_order import StereoOrder
 from ..model.presets import preset

@@ -12,9 +12,9 @@ from ..core.types import Frame
 from ..data import FrameSequence
 from ..data.files import in_order
 from ..data.images import read_color
-from ..footage.components import Image, InOrder, Mask
+from ..data.mask_files import Polarity, mask_polarity
 from ..footage.depth_unit import UnitGuess, guess_unit
-from ..footage.mask_polarity import Polarity, mask_polarity
+from ..footage.image_operations import Image, InOrder, Mask
 from ..footage.pose_fit import PoseFit, RgbdFrame, measure_poses
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
 
@@ -100,8 +100,8 @@ def _pairs(sequence: FrameSequence) -> list[tuple[Image, Image]]:
     if len(files) != count or read_color(files[0]).shape[:2] != (camera.height, camera.width):
         return []  # shrunk, or only a part of the folder: the matching of images to frames is unknown
     return [
-        (sequence.frame(int(i)).rgb_u8, read_color(files[int(i)], (camera.width, camera.height)))
-        for i in np.linspace(0, count - 1, COMPARED).round()
+        (sequence.frame(i).rgb_u8, read_color(files[i], (camera.width, camera.height)))
+        for i in evenly_spaced(count, COMPARED)
     ]
 
 

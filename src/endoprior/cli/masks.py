@@ -62,7 +62,7 @@ class Masks(Command):
             fix = f"call it with {other[0]} first, then without."
             raise input_error(clicked[0], f"no {other[0]}", other[0], fix)
         from ..data import load_sequence
-        from ..data.writer import writable_masks
+        from ..data.edit import writable_masks
 
         sequence = load_sequence(self.data)
         writable_masks(sequence)
@@ -74,10 +74,10 @@ class Masks(Command):
 
     def _find_all(self, sequence: FrameSequence) -> None:
         """Find the tools of every frame, by our own means or by a segmenter that they prompt."""
+        from ..data.edit import note_found_masks
         from ..data.found_tools import FrameRow, uncertain_frames, write_rows
-        from ..data.writer import note_found_masks
         from ..prepare.networks import open_sam2
-        from ..tool_masks.mask_store import find_in_sequence
+        from ..tool_masks.tool_finder import find_in_sequence
         from ..tool_masks.video_segmenter import segment_sequence
 
         rows, segmenter = list[FrameRow](), None
@@ -135,7 +135,7 @@ def _replacing(
     sequence: FrameSequence, also_shown: Set[int] = frozenset()
 ) -> Iterator[tuple[Callable[..., None], Path, Counting]]:
     """Yield what takes the mask of a frame, a folder to work in, and the progress; then write masks and sheet."""
-    from ..data.writer import replace_masks
+    from ..data.edit import replace_masks
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import mask_sheet, write_png
 

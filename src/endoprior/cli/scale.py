@@ -30,7 +30,7 @@ class Scale(Command):
 
     def execute(self) -> None:
         """Find the scale and write it."""
-        from ..data.scale_files import finish_scale
+        from ..data.edit import finish_scale
         from ..prepare.scale import scale_folder
 
         if not (self.known_length or self.shaft_mm):

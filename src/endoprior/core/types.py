@@ -78,6 +78,16 @@ class Frame:
         return self.rgb_u8.astype(np.float32) / np.float32(255)
 
 
+def frame_times(count: int) -> list[float]:
+    """`Frame.time` of each of `count` frames."""
+    return [index / count for index in range(count)]
+
+
+def to_uint8(color: NDArray) -> NDArray[np.uint8]:
+    """Values as an 8-bit file stores them: clipped to [0, 1], times 255, halves rounded up."""
+    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 @dataclass(frozen=True)
 class Fingerprints:
     """What tells a sequence from others: SHA-256, in hex, of the names and contents of its files."""

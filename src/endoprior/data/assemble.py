@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,10 +90,9 @@ def assemble(
     def read_frame(index: int) -> Frame:
         rgb_u8, tissue_mask, measured = decode(index)
         depth, depth_valid = clean_depth(measured, cfg) if clip_depth else (measured, measured > 0)
-        sureness = None if confidence is None else confidence(index)
-        frame = Frame(
-            index, index / count, cameras[index], rgb_u8, tissue_mask, depth, depth_valid, depth_confidence=sureness
-        )
+        frame = Frame(index, index / count, cameras[index], rgb_u8, tissue_mask, depth, depth_valid)
+        if confidence is not None:
+            frame = replace(frame, depth_confidence=confidence(index))
         return shrunk(frame, cfg.shrink)
 
     return FrameSequence(

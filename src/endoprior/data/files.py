@@ -1,7 +1,9 @@
-"""Files of a dataset folder: what their names say, and their order."""
+"""Files of a dataset folder: what their names say, their order, their fingerprint, and whether they changed."""
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
 from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
@@ -10,7 +12,8 @@ from string import ascii_lowercase, ascii_uppercase
 
 from ..core.checks import input_error, similar_name
 from ..core.shell import quoted
-from .reading import ACCESS_HINT
+from ..core.types import Fingerprints
+from .reading import ACCESS_HINT, reading
 
 DECIMAL = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 LETTERED, ALPHABETS = re.compile("#[A-Za-z]$"), (ascii_lowercase, ascii_uppercase)
@@ -23,6 +26,7 @@ CONFIDENCE = "depth_confidence"  # folder with how surely the depth of each fram
 DEPTH_WORDS = {"depth", "depths", "disp", "disparity", "z"}
 OTHER_WORDS = {"normal", "normals", "flow", "occlusion", "overlay", "confidence", "uncertainty", "visualization", "vis"}
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of color images that readers accept
+FileState = tuple[int, int, int] | None
 
 
 def words_of(stem: str) -> set[str]:
@@ -211,3 +215,36 @@ def file_below(folder: Path, name: str, source: Path) -> Path:
     if PureWindowsPath(name).drive or not found.is_relative_to(folder):
         raise input_error(source, "paths from its folder", name[:80], "write paths relative to the file.")
     return found
+
+
+def state_of(file: Path) -> FileState:
+    """What changes with the contents of a file, without reading them; None if there is no such file."""
+    try:
+        facts = file.stat()
+    except OSError:
+        return None
+    return facts.st_mtime_ns, facts.st_ctime_ns, facts.st_size
+
+
+def demand_same(files: Sequence[Path], states: Sequence[FileState], before: Sequence[FileState]) -> None:
+    """Raise InputError if the state of a file is not what it was before."""
+    for file, now, then in zip(files, states, before, strict=True):
+        if now != then:
+            fix = "Put the data back and resume, or train on the new data in a new folder."
+            raise input_error(file, "data that stays as it is during training", "a file that was changed", fix)
+
+
+def fingerprints_of(files: Sequence[Path], images: Sequence[Path], folder: Path) -> Fingerprints:
+    """The fingerprints of a sequence in a folder: `files` are all of it, `images` some of them."""
+    digests = dict[Path, bytes]()
+    for file in sorted(set(files)):
+        with reading(file), file.open("rb") as content:
+            digests[file] = hashlib.file_digest(content, "sha256").digest()
+
+    def joined(some: Sequence[Path]) -> str:
+        whole = hashlib.sha256()
+        for file in sorted(some):
+            whole.update(os.fsencode(file.relative_to(folder).as_posix()) + b"\0" + digests[file])
+        return whole.hexdigest()
+
+    return Fingerprints(joined(files), joined(images) if images else "")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..system.atomic import write_json
+from .description import TOOLS_FOUND
 from .reading import read_json
 
 FILE = "tool_masks.json"
@@ -100,3 +101,9 @@ def mark_moving(folder: Path, frames: Iterable[int]) -> None:
 def uncertain_frames(rows: Iterable[FrameRow]) -> list[int]:
     """The frames whose masks should be looked at."""
     return [row.frame for row in rows if row.confidence < UNCERTAIN]
+
+
+def found_source(with_tools: float, followed_by: str = "") -> str:
+    """The source of masks that a program found in a share of the frames, 0..1, and another followed, if any."""
+    found = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
+    return f"{found}, followed by {followed_by}" if followed_by else found

@@ -23,6 +23,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ..core.checks import input_error
 from ..core.shell import install_command
+from ..system.atomic import whole_file
 from .pixels import is_measured
 from .reading import MAX_PIXELS, demand_file, read_bytes, read_only_array
 
@@ -35,6 +36,7 @@ TURNED = range(5, 9)  # orientations, as EXIF counts them, that exchange width a
 MIRRORED = (2, 4, 5, 7)
 SILENT = 0  # OpenCV: LOG_LEVEL_SILENT
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
+TOOL_VALUE = 255  # of tool pixels in mask files that this program writes; tissue is 0
 Size = tuple[int, int]
 
 
@@ -144,7 +146,7 @@ def read_color(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[..., 2::-1])
 
 
-def read_tool_mask(path: Path, tool_value: int = 255, size: Size | None = None) -> NDArray[np.bool_]:
+def read_tool_mask(path: Path, tool_value: int = TOOL_VALUE, size: Size | None = None) -> NDArray[np.bool_]:
     """(H, W) True on tools, of an 8-bit image with values 0 and 255 only, one of which is that of tools."""
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype != np.uint8:
@@ -156,6 +158,17 @@ def read_tool_mask(path: Path, tool_value: int = 255, size: Size | None = None) 
         got = ", ".join(map(str, other[:4])) + (" and more" if len(other) > 4 else "")
         raise input_error(path, "mask values 0 and 255", got, hint)
     return high if tool_value == 255 else ~high
+
+
+def tool_mask_pixels(tool_mask: NDArray[np.bool_], tool_value: int = TOOL_VALUE) -> NDArray[np.uint8]:
+    """(H, W) stored values of a mask, (H, W) True on tools; `tool_value` is that of tools in the file, 255 or 0."""
+    return np.where(tool_mask if tool_value == 255 else ~tool_mask, 255, 0).astype(np.uint8)
+
+
+def write_tool_mask(file: Path, tool_mask: NDArray[np.bool_], tool_value: int = TOOL_VALUE) -> None:
+    """Write one mask, atomically; arguments as in `tool_mask_pixels`."""
+    with whole_file(file) as temporary:
+        save_png(temporary, tool_mask_pixels(tool_mask, tool_value))
 
 
 def read_share(path: Path, size: Size | None = None) -> NDArray[np.float32]:

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
-from ..footage.mask_polarity import Polarity, mask_polarity
+from ..core.checks import check_shape, input_error
+from ..footage.image_operations import Image, Mask
 from .images import Size, decode_image
 from .reading import read_only_array
 
@@ -32,7 +32,6 @@ LOSSY = (".jpg", ".jpeg", ".webp")
 MAX_LABEL_COLORS = 256  # a file with more colors is a photo, not a mask
 MIN_CERTAINTY = 0.5  # if the detected polarity is less certain, high values mark tools by convention
 OPTION = "--mask-labels"
-Mask = NDArray[np.bool_]
 Label = TypeVar("Label")
 
 
@@ -226,23 +225,6 @@ def demand_known(folder: Path, rule: HighValues, fix: str) -> None:
         raise input_error(folder, "masks of tools, or labels on a background of 0", rule.doubt, fix)
 
 
-def tool_polarity(
-    tool_value: Literal["auto", "high", "low"], highs: Sequence[Mask], images: Sequence[NDArray[np.uint8]]
-) -> Polarity:
-    """Which value marks tools: the given one, else the detected one, else high values by convention.
-
-    `highs` are of `read_user_mask`, `images` the frames of these masks; a dozen are enough. The `reason` is for users.
-    """
-    if tool_value != "auto":
-        return Polarity(tool_value == "high", 1.0, f"{tool_value} values mark tools (--mask-tool-value)")
-    detected = mask_polarity(highs, images)
-    if detected.certainty < MIN_CERTAINTY:
-        reason = f"detection unclear, high values mark tools by convention: {detected.reason}"
-        return Polarity(True, detected.certainty, reason)
-    value = "high" if detected.tool_is_high else "low"
-    return replace(detected, reason=f"{value} values mark tools: {detected.reason}")
-
-
 def _numbers(path: Path) -> NDArray:
     """(H, W) bool or finite numbers of a file; a color is a number from `COLOR` on, and black is 0."""
     hint = "Save one array of shape (height, width)."
@@ -279,3 +261,79 @@ def _of_colors(path: Path, pixels: NDArray) -> NDArray:
         raise input_error(path, "a mask", "an image of many colors", "Pass masks, not photos or overlays.")
     is_gray = np.ptp(color, axis=-1) == 0
     return np.where(is_gray, color[..., 1].astype(np.int64), numbers)
+
+
+LIT = 25  # Darker pixels (largest channel, 0..255) are ignored: they are outside a round border or in shadow
+MIN_LIT_REGION_SHARE = 0.0005  # A region with a smaller share of the lit pixels counts as empty
+AREA_WEIGHT, BORDER_WEIGHT = 4.0, 2.0
+"""Log-odds per unit of area and border: 10 % of the area gives odds of 5 : 1 for tools, 40 % gives 1.5 : 1."""
+COLOR_WEIGHT, COLOR_LIMIT = 1.5, 3.0
+"""Log-odds per standard deviation of the redness difference, and its limit in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Polarity:
+    """The value that marks tools, and the certainty of the detection."""
+
+    tool_is_high: bool  # True where values above half mark tools
+    certainty: float  # From 0 (unknown) to 1 (certain)
+    reason: str  # The measurements in one line
+
+
+def mask_polarity(highs: Sequence[Mask], images: Sequence[Image]) -> Polarity:
+    """Detect which value of the masks marks tools: of the two regions, the smaller and grayer one with less of the
+    border. If one value does not occur, that one, with certainty 0.
+
+    Args:
+        highs: (H, W) True where the mask's value is high. images: (H, W, 3) their frames; a dozen are enough.
+    """
+    if not highs:
+        raise ValueError("highs must hold at least one mask, got none")
+    sides, reds, rims = [], [], []
+    for high, image in zip(highs, images, strict=True):
+        check_shape("high:H,W image:H,W,3", high=high, image=image)
+        rim = np.zeros(high.shape, bool)
+        rim[[0, -1]] = rim[:, [0, -1]] = True
+        step = max(1, min(high.shape) // 160)  # subsample the interior, but use every border pixel
+        few = rim.copy()
+        few[::step, ::step] = True
+        few &= image.max(-1) > LIT
+        color = image[few].astype(np.float64) + 10  # the offset stabilizes the ratio of dark, noisy pixels
+        reds.append(np.log(color[:, 0] / color[:, 1]))
+        sides.append(high[few])
+        rims.append(rim[few])
+    side, redness, at_rim = (np.concatenate(parts) for parts in (sides, reds, rims))
+    inner = side[~at_rim]
+    area = float(inner.mean()) if inner.size else 0.0
+    if not MIN_LIT_REGION_SHARE < area < 1 - MIN_LIT_REGION_SHARE:
+        value = "high" if area > 0.5 else "low"
+        return Polarity(area <= 0.5, 0.0, f"almost all pixels are {value}: polarity unknown")
+    border = float(side[at_rim].mean()) if at_rim.any() else 0.5
+    high_red, low_red = (float(np.median(redness[side == value])) for value in (True, False))
+    deviation = np.median([np.median(np.abs(redness[side == v] - m)) for v, m in ((True, high_red), (False, low_red))])
+    # 1.48 median absolute deviations are a standard deviation; 0.05 is the variation of gray between cameras.
+    grayer = (low_red - high_red) / (1.48 * float(deviation) + 0.05)
+    by_color = COLOR_WEIGHT * float(np.clip(grayer, -COLOR_LIMIT, COLOR_LIMIT))
+    log_odds = AREA_WEIGHT * (0.5 - area) + BORDER_WEIGHT * (0.5 - border) + by_color
+    reason = (
+        f"high values cover {area:.0%} of the image and {border:.0%} of its border, "
+        f"redness {high_red:.2f} against {low_red:.2f} elsewhere"
+    )
+    return Polarity(log_odds >= 0, float(np.tanh(abs(log_odds) / 2)), reason)
+
+
+def tool_polarity(
+    tool_value: Literal["auto", "high", "low"], highs: Sequence[Mask], images: Sequence[Image]
+) -> Polarity:
+    """Which value marks tools: the given one, else the detected one, else high values by convention.
+
+    `highs` are of `read_user_mask`, `images` the frames of these masks; a dozen are enough. The `reason` is for users.
+    """
+    if tool_value != "auto":
+        return Polarity(tool_value == "high", 1.0, f"{tool_value} values mark tools (--mask-tool-value)")
+    detected = mask_polarity(highs, images)
+    if detected.certainty < MIN_CERTAINTY:
+        reason = f"detection unclear, high values mark tools by convention: {detected.reason}"
+        return Polarity(True, detected.certainty, reason)
+    value = "high" if detected.tool_is_high else "low"
+    return replace(detected, reason=f"{value} values mark tools: {detected.reason}")

@@ -1,4 +1,6 @@
-"""Decoded pixels made ready: which depth is measured, outliers clipped, frames at a fraction of their size."""
+"""Decoded pixels made ready: which depth is measured, outliers clipped, overexposed pixels weighted less, frames at a
+fraction of their size.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.config import DataConfig
 from ..core.types import SURE_DEPTH, Camera, Frame
+from ..footage.image_operations import Image, Mask, smallest_channel, square
 
 GAP = 1.5  # a number is a filling if it is larger than all others by this factor ...
 MIN_FAR_PIXELS = 8  # ... and occurs in at least so many pixels, which measured depth at such a distance does not
@@ -112,6 +115,37 @@ def measured_share(frames: Iterable[Frame]) -> float | None:
         if frame.depth_confidence is not None
     ]
     return sum(shares) / len(shares) if shares else None
+
+
+SATURATED = 250  # a pixel is saturated if its smallest channel reaches this level: its color is at least as bright
+SATURATED_SHARE = 0.02  # least share of tissue that is, else it is the usual highlights, which are to be modelled
+GLARE_PX = 2  # so far around saturated pixels their light spreads
+GLARE_WEIGHT = 0.5
+"""How far such pixels are believed beside others. Other frames may show the true color; but what no frame shows better
+needs a color, else there is a hole, and with far less what is white most of the time becomes dark."""
+
+
+def overexposed(frame: Frame) -> Mask | None:
+    """(H, W) True on saturated tissue; None where that is no more than the usual highlights."""
+    saturated = is_saturated(frame.rgb_u8) & frame.tissue_mask
+    glares = np.count_nonzero(saturated) > SATURATED_SHARE * max(np.count_nonzero(frame.tissue_mask), 1)
+    return saturated if glares else None
+
+
+def is_saturated(rgb_u8: Image) -> Mask:
+    """(H, W) True where an image (H, W, 3) is saturated."""
+    return smallest_channel(rgb_u8) >= SATURATED
+
+
+def weighted(frame: Frame, weight: float) -> Frame:
+    """The frame with its weight on every pixel, and less where it is overexposed; itself where all are 1."""
+    saturated = overexposed(frame)
+    if weight == 1 and saturated is None:
+        return frame
+    believed = np.full(frame.tissue_mask.shape, weight, np.float32)
+    if saturated is not None:
+        believed[cv2.dilate(saturated.astype(np.uint8), square(GLARE_PX)) > 0] *= GLARE_WEIGHT
+    return replace(frame, weight=believed)
 
 
 def shrunk_camera(camera: Camera, factor: int) -> Camera:

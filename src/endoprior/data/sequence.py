@@ -20,9 +20,11 @@ from ..core.config import DataConfig
 from ..core.types import Camera, Fingerprints, Frame
 from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
-from .contents import demand_same, demand_trainable, fingerprints_of, frame_contents, state_of, weighted
 from .description import ESTIMATED_POSES, TOOLS_FOUND
+from .files import demand_same, fingerprints_of, state_of
+from .pixels import weighted
 from .scale import Scale
+from .trainable import demand_trainable, frame_contents
 from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]
@@ -46,7 +48,7 @@ class FrameSpan(Protocol):
 
 
 @dataclass(frozen=True)
-class Looks:
+class FrameSummaries:
     """What the frames show, in short, for the plan of windows; `T` frames."""
 
     thumbnails: NDArray[np.float32]  # (T, h, w, 3) color in [0, 1]
@@ -98,8 +100,8 @@ class FrameSequence:
     """How `load_sequence` read it; None for a sequence that was made in another way."""
     read_again: Callable[[DataConfig], FrameSequence] | None = None
     """Reads the whole sequence in another way; None for a part or a changed one, which would be lost."""
-    looks: Looks | None = None
-    """What `window_plan.look_through` found; None before."""
+    summaries: FrameSummaries | None = None
+    """What `window_plan.summarize_frames` found; None before."""
 
     def __post_init__(self) -> None:
         self._states = [state_of(file) for file in self.files]
@@ -308,7 +310,7 @@ class FrameSequence:
     def _with(self, **changes: Any) -> FrameSequence:
         """A view of this sequence with other attributes; frames that are read in another way are cached anew."""
         view = copy(self)
-        vars(view).update({"looks": None, "read_again": None} | changes)
+        vars(view).update({"summaries": None, "read_again": None} | changes)
         if "_read_frame" in changes:
             view._cache = BoundedCache(cache_bytes(), _frame_bytes)
         return view

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ..core.types import Camera
-from .sequence import FrameSequence, Looks
+from .sequence import FrameSequence, FrameSummaries
 
 TURN_DEGREES = 15.0
 """A window ends where the camera has turned by this since the window's first frame, degrees, ..."""
@@ -24,14 +24,14 @@ window is worse by up to 4 dB near its end."""
 THUMBNAIL = (32, 24)  # (width, height) of the pictures that are compared, px: noise and texture are averaged out
 
 
-def look_through(sequence: FrameSequence) -> Looks:
+def summarize_frames(sequence: FrameSequence) -> FrameSummaries:
     """Decode every training frame once; a held-out frame counts as the training frame before it, or the first one."""
-    if sequence.looks is None:
-        sequence.looks = _look_through(sequence)
-    return sequence.looks
+    if sequence.summaries is None:
+        sequence.summaries = _summarize_frames(sequence)
+    return sequence.summaries
 
 
-def _look_through(sequence: FrameSequence) -> Looks:
+def _summarize_frames(sequence: FrameSequence) -> FrameSummaries:
     training = np.array(sequence.indices("train"))
     thumbnails = np.zeros((len(training), *THUMBNAIL[::-1], 3), np.float32)
     depth_mm = np.full(len(training), np.nan)
@@ -41,10 +41,10 @@ def _look_through(sequence: FrameSequence) -> Looks:
         measured = frame.depth[frame.depth_valid & frame.tissue_mask]
         depth_mm[position] = np.median(measured) if measured.size else np.nan
     shown = np.maximum(np.searchsorted(training, np.arange(len(sequence)), "right") - 1, 0)
-    return Looks(thumbnails[shown], depth_mm[shown])
+    return FrameSummaries(thumbnails[shown], depth_mm[shown])
 
 
-def plan_windows(cameras: Sequence[Camera], looks: Looks, longest: int) -> list[tuple[int, int]]:
+def plan_windows(cameras: Sequence[Camera], summaries: FrameSummaries, longest: int) -> list[tuple[int, int]]:
     """First frame and the frame after the last one of every window, in order; one window if nothing asks for more.
 
     A window goes on beyond the frame that ends it until it shares frames with the next one.
@@ -60,16 +60,16 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, longest: int) -> list[
     rotations = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
     centers = np.stack([camera.center for camera in cameras])
     moving = bool(np.ptp(centers, axis=0).any() or np.ptp(rotations, axis=0).any())
-    usual_mm = float(np.nanmedian(looks.depth_mm)) if np.isfinite(looks.depth_mm).any() else np.inf
+    usual_mm = float(np.nanmedian(summaries.depth_mm)) if np.isfinite(summaries.depth_mm).any() else np.inf
 
     def has_changed(first: int, index: int) -> bool:
         """Whether one of the rules ends a window that starts at `first` before frame `index`."""
-        depth_mm = looks.depth_mm[first] if np.isfinite(looks.depth_mm[first]) else usual_mm
+        depth_mm = summaries.depth_mm[first] if np.isfinite(summaries.depth_mm[first]) else usual_mm
         cosine = (np.trace(rotations[first] @ rotations[index].T) - 1) / 2
         return bool(
             np.degrees(np.arccos(np.clip(cosine, -1, 1))) > TURN_DEGREES
             or np.linalg.norm(centers[index] - centers[first]) > SHIFT_SHARE * depth_mm
-            or np.abs(looks.thumbnails[index] - looks.thumbnails[first]).mean() > PICTURE_CHANGE
+            or np.abs(summaries.thumbnails[index] - summaries.thumbnails[first]).mean() > PICTURE_CHANGE
         )
 
     starts, first = [0], 0

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
+from ..core.types import to_uint8
 from ..data import FrameList, FrameSequence, Split
 from ..data.reading import of_type, read_own, read_parts
 from ..model.scene import RenderedScene, Scene
@@ -33,11 +34,6 @@ NO_GAUSSIANS = "needs the Gaussians of a scene; this one has none"
 NO_DEPTH = "needs depth, which was not rendered for every frame"
 Rendering = tuple[NDArray[np.float32], NDArray[np.float32] | None]
 """Color (H, W, 3) in [0, 1], and depth (H, W) in mm as z, 0 where nothing is; None for no depth."""
-
-
-def to_uint8(color: NDArray) -> NDArray[np.uint8]:
-    """(H, W, 3) color as an 8-bit file stores it: clipped to [0, 1], times 255, halves rounded up."""
-    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 class Reconstruction(Protocol):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.types import Camera
 from ..data import FrameSequence, Split, read_depth_file
-from ..data.files import entries, files_with
+from ..data.files import entries, files_with, fingerprint_of
 from ..data.frame_files import HINT, match_names
 from ..data.images import decode_image, describe_pixels, single_channel
 from ..data.reading import kind_of
@@ -81,10 +80,8 @@ class Pictures:
 
 def fingerprint(folder: Path, suffixes: tuple[str, ...] = (".png", ".npy")) -> str:
     """SHA-256, in hex, of the names and contents of the files of a folder with one of the suffixes."""
-    digest = hashlib.sha256()
-    for file in sorted(file for file in entries(folder) if file.is_file() and file.suffix.lower() in suffixes):
-        digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
+    files = [file for file in entries(folder) if file.is_file() and file.suffix.lower() in suffixes]
+    return fingerprint_of(files, folder)
 
 
 def frames_of_files(

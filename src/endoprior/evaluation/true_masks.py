@@ -26,9 +26,9 @@ from ..data.images import read_color
 from ..data.mask_files import MASK_SUFFIXES, demand_known, read_user_mask, rule_of_files, tool_polarity
 from ..data.reading import kind_of
 from ..footage.border import find_outline
-from ..footage.components import Image, Mask, components, dilated, distance_inside
+from ..footage.image_operations import Image, Mask, components, dilated, distance_inside
 from ..footage.text_network import TextDetector
-from ..footage.texts import resting_rectangles
+from ..footage.texts import static_rectangles
 from ..system.atomic import write_json
 from .context import Evaluation
 from .pictures import fingerprint, frames_of_files
@@ -277,7 +277,7 @@ def counted_pixels(images: Sequence[Image], always_masked: Mask) -> Mask:
 
 def _labels(images: Sequence[Image], black: Mask, border: Mask, always_masked: Mask) -> Mask:
     """(H, W) True on burned-in text, on painted rectangles, and on always masked regions that they cover largely."""
-    boxes = resting_rectangles(images, TextDetector().find) if (always_masked & ~border).any() else []
+    boxes = static_rectangles(images, TextDetector().find) if (always_masked & ~border).any() else []
     for x, y, width, height, area in components(black, 4)[1][1:].tolist():
         if area == width * height and min(width, height) >= MIN_RECTANGLE_PX:  # a dark tool has another shape
             boxes.append((x, y, width, height))

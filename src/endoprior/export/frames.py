@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from ..core.geometry import camera_to_world
 from ..core.shell import command
-from ..core.types import Camera
+from ..core.types import Camera, to_uint8
 from ..data.images import encode_png
 from ..model.scene import Scene
 from ..model.surface import render_surface
 from ..system.atomic import whole_folder, write_json, write_text
-from ..visualization.image_tools import to_u8
 from ..visualization.video import write_video
 from .axes import points_in_axes
 from .formats import TIME_STEP_OPTIONS, Axes, ExportFormat, ExportOptions, Progress
@@ -108,7 +107,7 @@ def write_rendered(scene: Scene, out: Path, options: ExportOptions, progress: Pr
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for k, i in enumerate(indices):
-            yield to_u8(scene.render(i / len(scene.cameras), scene.cameras[i]).color.numpy())
+            yield to_uint8(scene.render(scene.frame_time(i), scene.cameras[i]).color.numpy())
             progress(k + 1, len(indices))
 
     write_video(out, images(), scene.frames_per_second)

@@ -36,7 +36,7 @@ from torch import Tensor
 
 from ..core.checks import InputError, input_error
 from ..core.geometry import length_unit
-from ..core.types import Camera, Splats
+from ..core.types import Camera, Splats, frame_times
 from ..model.carry import TIED_ANEW_PX
 from ..model.photometric import GRID
 from ..model.scene import Scene, Shown, faded
@@ -109,7 +109,7 @@ def write_html(
     if out.is_dir():
         raise input_error(out, "a file to write", "a folder", f"add a name such as {out / 'scene.html'}.")
     if times is None:
-        times = [i / len(scene.cameras) for i in range(len(scene.cameras))]
+        times = frame_times(len(scene.cameras))
     if not times or any(b <= a for a, b in pairwise(times)):
         raise input_error("times", "one or more increasing times", f"{times}", "list each time once.")
     data, of_blocks = _packed_blocks(scene, times, out, max_bytes)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.geometry import Strain, length_unit, project, unit_vectors
+from ..core.types import frame_times
 from ..model.carry import CarriedPoints, carry
 from ..model.measures import Measures, SurfaceMotion, distance, measures_of
 from ..model.scene import Scene
@@ -73,7 +74,7 @@ def moving_surface(scene: Scene, options: ExportOptions) -> MovingSurface:
     """
     num_frames = len(scene.cameras)
     since, until = _frames(options, num_frames)
-    times = [i / num_frames for i in range(num_frames)]
+    times = frame_times(num_frames)
     shown = render_surface(scene, times[since], scene.cameras[since], options.min_alpha)
     mesh = depth_grid(shown, options.mesh_step, options.max_slope)
     if not len(mesh.triangles):
@@ -156,7 +157,7 @@ def _measured(scene: Scene, options: ExportOptions, since: int) -> tuple[NDArray
     """Of the points of the options: (T, P, 3) their paths, mm, the measures since a frame, (T, P) confidence."""
     assert options.points is not None, "no file of points"
     num_frames, queries = len(scene.cameras), read_query_points(options.points, scene)
-    times = [i / num_frames for i in range(num_frames)]
+    times = frame_times(num_frames)
     followed = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
     paths, motion = followed.positions, SurfaceMotion(scene, since, options.min_alpha)
     around = motion.stretch(paths[since].astype(np.float64), list(range(num_frames)))

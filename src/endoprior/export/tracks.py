@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.types import frame_times
 from ..data import FrameSequence, load_sequence
 from ..evaluation.scoring import scored_data
 from ..model.carry import carry
@@ -40,7 +41,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         InputError: the file of query points or the sequence cannot be read, or a query point shows no surface.
     """
     cameras = scene.cameras
-    times = [i / len(cameras) for i in range(len(cameras))]
+    times = frame_times(len(cameras))
     sequence = None if options.data is None else _sequence_of(scene, options.data)
     with whole_folder(out) as folder:
         if options.points:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask, components, regions_where, square
+from .image_operations import Image, Mask, components, regions_where, square
 
 FINEST_PX, HALVINGS = 160, 2
 """Images are aligned at this width, after the halved ones. Finer detail is noise, or a pattern of sensor or fibers that

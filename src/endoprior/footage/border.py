@@ -15,9 +15,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import AREA, Image, Mask, components, dilated, disk, distance_inside, regions_where, square
-from .dark_outline import Circle, Darkness, blurred, brightness, find_darkness, reduced
-from .round_border import find_circle
+from .image_operations import (
+    AREA,
+    Image,
+    Mask,
+    components,
+    dilated,
+    disk,
+    distance_inside,
+    largest_channel,
+    regions_where,
+    smallest_channel,
+    square,
+)
+from .round_border import Circle, Darkness, blurred, find_circle, find_darkness, reduced
 
 IN_SAMPLES = 0.9  # The outside is dark in this share of the samples; glare reaches over a border now and then
 MAX_LEVEL = 20  # Median level of what can be outside
@@ -54,7 +65,7 @@ def find_outside(images: Sequence[Image], inside: Mask | None = None) -> Outside
         images: K samples (H, W, 3) of one size.
         inside: (H, W) True inside of a border that is known already; None for all.
     """
-    grays = [blurred(brightness(image)) for image in images]
+    grays = [blurred(largest_channel(image)) for image in images]
     inside = np.ones(grays[0].shape, bool) if inside is None else inside
     darkness = find_darkness(reduced(grays)[0])
     if darkness is None or darkness.level >= MAX_LEVEL or not inside.any():
@@ -83,7 +94,7 @@ def hidden_by_moving_border(image: Image, level: float, inside: Mask) -> Mask:
         level: of `Outside`.
         inside: (H, W) True where the clip shows something.
     """
-    found = _cut(blurred(brightness(image)), level, Darkness(0.0, level / 4), inside).mask
+    found = _cut(blurred(largest_channel(image)), level, Darkness(0.0, level / 4), inside).mask
     return dilated(found, square(MIN_REACH_PX)) & inside if found.any() else found
 
 
@@ -153,8 +164,6 @@ def _rim(usual: Image, outside: Mask, inside: Mask) -> int:
             return width
     return reach
 
-
-__all__ = ["Circle", "Outline", "Outside", "Strips", "find_circle", "find_outline", "find_strips", "masked_border"]
 
 BLACK_LEVEL = 28  # Levels 0..255 below this are black, including limited-range video with coding noise
 MIN_STRIP_PX = 3  # Thinner strips are ignored; they can be coding noise
@@ -245,8 +254,9 @@ def find_strips(images: Sequence[Image], circle: Circle | None = None) -> Strips
     grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
     mean = sum(grays) / len(grays)
     change = np.sqrt(sum((gray - mean) ** 2 for gray in grays) / len(grays))
-    chroma = sum((brightness(image) - ~brightness(~image)).astype(np.float32) for image in images) / len(images)
-    brightest = np.maximum.reduce([brightness(image) for image in images])
+    spans = [largest_channel(image) - smallest_channel(image) for image in images]
+    chroma = sum(span.astype(np.float32) for span in spans) / len(images)
+    brightest = np.maximum.reduce([largest_channel(image) for image in images])
     height, width = brightest.shape
     central_change = float(np.median(change[height // 4 : height - height // 4, width // 4 : width - width // 4]))
     inside = circle.mask(width, height, circle.margin_px) if circle else np.ones((height, width), bool)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .alignment import align, mean_shift
-from .components import Image, InOrder, Mask
-from .optical_flow import follow_both_ways
+from .image_operations import Image, InOrder, Mask
+from .keypoints import track_points
 
 WORK_WIDTH = 320  # Images are resized to this width, px: enough for hundreds of corners, and fast
 MAX_CORNERS = 400
@@ -176,7 +176,7 @@ def _step(before: _Seen, now: _Seen) -> NDArray | None:
     if found is None or len(found) < MIN_TRACKS:
         return None
     corners = np.asarray(found[:, 0], np.float32)
-    there, good = follow_both_ways(before.gray, now.gray, corners, side_px=15)
+    there, good = track_points(before.gray, now.gray, corners, side_px=15)
     if good.sum() < MIN_TRACKS:
         return None
     cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator

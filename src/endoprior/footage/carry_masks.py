@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape
-from .components import Image, Mask
+from .image_operations import Image, Mask
 from .optical_flow import MIN_SIZE_PX, flow_pair, flow_shrink, gray_for_flow
 
 CARRY_ROUND_TRIP_PX, CARRY_ROUND_TRIP_SHARE = 1.5, 0.1

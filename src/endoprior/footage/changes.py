@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, InOrder, runs
 from .disturbances import FrameQuality, disturbances, measure_quality, small_size
+from .image_operations import Image, InOrder, runs
 from .scenes import REACH, ImageFeatures, change, jumps, places_differ, same_view, standardized
 from .scenes import THUMB_WIDTH as SCENE_WIDTH
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask
+from .image_operations import Image, Mask
 
 Unit = Literal["mm", "m", "cm", "0.1 mm", "0.01 mm", "ambiguous", "disparity", "none"]
 NEAR_MM, FAR_MM = 20.0, 250.0  # Usual distances from an endoscope to tissue

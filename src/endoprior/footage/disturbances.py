@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask, square
-from .dark_outline import brightness
+from .image_operations import Image, Mask, largest_channel, smallest_channel, square
 
 PIXELS = 30_000  # images are measured and matched at about this size
 SEEN = 24  # level that a pixel reaches at some time, unless it lies outside of the endoscope's image
@@ -42,7 +41,7 @@ def small_size(width: int, height: int) -> tuple[int, int]:
 
 def view_mask(images: Sequence[Image]) -> Mask:
     """(h, w) True where some image (h, w, 3) of a clip shows something, without the rim; all True if that is little."""
-    seen = np.max([brightness(image) for image in images], 0) > SEEN
+    seen = np.max([largest_channel(image) for image in images], 0) > SEEN
     inside = cv2.erode(seen.astype(np.uint8), square(RIM_PX), borderType=cv2.BORDER_REPLICATE) > 0
     return inside if inside.mean() > 0.05 else np.ones_like(inside)
 
@@ -50,8 +49,8 @@ def view_mask(images: Sequence[Image]) -> Mask:
 def measure_quality(small: Image, view: Mask) -> FrameQuality:
     """Measure a small image (h, w, 3), see `small_size`, inside a mask (h, w) that is True somewhere."""
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    lowest = ~brightness(~small)
-    lit = view & (brightness(small) > LIT)
+    lowest = smallest_channel(small)
+    lit = view & (largest_channel(small) > LIT)
     if lit.mean() < 0.02:
         lit = view
     inner = cv2.erode(lit.astype(np.uint8), square(1)) > 0

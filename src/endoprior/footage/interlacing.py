@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image
+from .image_operations import Image
 
 Levels = NDArray[np.float32]  # gray values, 0 to 255
 BLOCK_PX, MIN_BLOCKS = 16, 8

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .camera_motion import CameraMotion, camera_motion
 from .changes import Changes, find_changes
-from .components import Image, InOrder, Mask
+from .image_operations import Image, InOrder, Mask
 
 Array = TypeVar("Array", Image, Mask)
 

@@ -1,18 +1,16 @@
-"""Optical flow between two images by OpenCV: dense by inverse search (Kroeger et al. 2016), of corners by Lucas and
-Kanade with pyramids (Bouguet 2001)."""
+"""Dense optical flow between two images by inverse search (Kroeger et al. 2016), by OpenCV; and what of it differs from
+the motion of the tissue as a whole."""
 
-# OpenCV's type stubs do not know that a start can be missing.
+# OpenCV's type stubs do not know that the guess can be missing.
 # pyright: reportCallIssue=false, reportArgumentType=false
 
 from __future__ import annotations
-
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask
+from .image_operations import Image, Mask
 
 MIN_SIZE_PX = 32  # Smallest image side that dense inverse search supports
 MOTION_S = 0.1
@@ -22,7 +20,6 @@ HALVED_FROM_PX = 256
 FIXED_IN_IMAGE_PX, FIXED_IN_IMAGE_SHARE = 3.0, 0.3
 """Where the image goes by the first or more, px at a width of 640, a point that goes less than this share is
 fixed in the image."""
-MAX_FORWARD_BACKWARD_PX = 1.0  # Largest forward-backward error of a corner that counts as followed
 FINE_SIDE_PX = 256  # Fine flow is computed on images shrunk by a whole number to at least this shorter side
 
 
@@ -83,54 +80,25 @@ def fixed_in_image(way: NDArray, expected: NDArray, width: int) -> Mask:
     return (far > FIXED_IN_IMAGE_PX * width / 640) & (gone < FIXED_IN_IMAGE_SHARE * far)
 
 
-def follow_both_ways(
-    first: Image,
-    second: Image,
-    pixels: NDArray[np.float32],
-    *,
-    max_error_px: float = MAX_FORWARD_BACKWARD_PX,
-    side_px: int = 21,
-    halvings: int = 3,
-    guess: NDArray[np.float32] | None = None,
-    criteria: tuple[int, int, float] | None = None,
-) -> tuple[NDArray[np.float32], Mask]:
-    """Where the second gray image shows pixels (N, 2) of the first, and (N,) False where the way back leads elsewhere.
+ROUNDS, EVERY = 8, 7  # rounds of the robust fit of that motion; every so many pixels take part in it
 
-    Args:
-        max_error_px: largest forward-backward error of x and of y, px; above it a pixel counts as lost.
-        side_px, halvings, guess, criteria: as of `follow_and_return`.
+
+def difference_from_background(flow: NDArray[np.float32], background: Mask) -> tuple[NDArray[np.float32], float]:
+    """(h, w) px by which flow (h, w, 2) differs from a smooth motion that explains most of the background (h, w).
+
+    That motion, by a camera or by breathing, is a quadratic function of the place. The second value is the median of
+    the difference on the background.
     """
-    there, back, found = follow_and_return(
-        first, second, pixels, side_px=side_px, halvings=halvings, guess=guess, criteria=criteria
-    )
-    return there, found & (np.abs(back - pixels).max(1) < max_error_px)
-
-
-def follow_and_return(
-    first: Image,
-    second: Image,
-    pixels: NDArray[np.float32],
-    *,
-    side_px: int,
-    halvings: int,
-    guess: NDArray[np.float32] | None = None,
-    criteria: tuple[int, int, float] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
-    """Where the second gray image shows pixels (N, 2) of the first, where the way back leads, and (N,) if both exist.
-
-    Args:
-        side_px: side of the window that is compared.
-        halvings: how often the images are halved; it bounds the motion that is found.
-        guess: (N, 2) where to start in the second image; without it at `pixels`.
-        criteria: when the iteration ends, as OpenCV has it; None for its default.
-    """
-    options: dict[str, Any] = {"winSize": (side_px, side_px), "maxLevel": halvings}
-    if criteria is not None:
-        options["criteria"] = criteria
-    if guess is not None:
-        options["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
-    start = None if guess is None else guess.copy()  # OpenCV overwrites it
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, pixels, start, **options)
-    home = None if guess is None else pixels + there - guess
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, home, **options)
-    return there, back, (found & found_back).ravel().astype(bool)
+    height, width = background.shape
+    y, x = (each.ravel() for each in np.mgrid[:height, :width] / np.array([height, width])[:, None, None] - 0.5)
+    terms, moved = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1), flow.reshape(-1, 2)
+    some = np.flatnonzero(background)[::EVERY]
+    weight, left, coefficients = np.ones(len(some)), np.zeros(len(some)), np.zeros((terms.shape[1], 2))
+    for _ in range(ROUNDS):
+        weighted = terms[some] * weight[:, None]
+        normal = weighted.T @ terms[some] + 1e-6 * np.eye(terms.shape[1])
+        coefficients = np.linalg.solve(normal, weighted.T @ moved[some])
+        left = np.hypot(*(moved[some] - terms[some] @ coefficients).T)
+        weight = 1 / (1 + (left / max(1.5 * np.median(left), 0.1)) ** 2)
+    difference = np.hypot(*(moved - terms @ coefficients).T).reshape(height, width)
+    return difference.astype(np.float32), float(np.median(left))

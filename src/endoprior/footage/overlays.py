@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from .components import AREA, Image, Mask, components, dilated, regions_where, square
+from .image_operations import AREA, Image, Mask, components, dilated, regions_where, square
 
 PURE, BOLD, FAINT = 0.25, 190, 110
 """In a pure color the middle channel is nearer to another than this share of the difference of the extreme ones. That

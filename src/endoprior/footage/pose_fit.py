@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..core.geometry import CONVENTIONS, Convention, to_ours
 from ..core.ranges import evenly_spaced
-from .components import Image, InOrder, square
-from .optical_flow import follow_both_ways
+from .image_operations import Image, InOrder, square
+from .keypoints import track_points
 
 RgbdFrame = tuple[Image, NDArray, NDArray[np.float32]]
 """Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""
@@ -214,7 +214,7 @@ def _follow(view: Callable[[int], RgbdFrame], matrix: NDArray, start: int, count
         following, tissue, _ = view(index)
         if len(kept) < MIN_CORNERS:
             return None
-        there, good = follow_both_ways(gray, following, pixels)
+        there, good = track_points(gray, following, pixels)
         good &= _sampled(tissue, there) > 0
         if good.sum() < MIN_CORNERS:
             break

@@ -19,9 +19,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from .alignment import align
-from .components import Image, Mask
-from .keypoints import keypoints, match_descriptors
-from .optical_flow import follow_both_ways
+from .image_operations import Image, Mask
+from .keypoints import keypoints, match_descriptors, track_points
 
 CORNERS, FEATURES = 200, 400  # most corners that are followed, and features that are compared, in an image
 MIN_MATCHES = 12  # so many points must move together; of images of different places, up to 7 do by chance
@@ -58,25 +57,27 @@ class GlobalMotion(NamedTuple):
     agreement: float  # share of the points that follow it
 
 
-def flow_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
+def motion_by_flow(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     """The common motion of corners from an image to the next one; None if too few are found again."""
     corners = before.corners
     if len(corners) < MIN_MATCHES:
         return None
-    there, good = follow_both_ways(before.gray, now.gray, corners, side_px=15)
-    return _link(corners[good], there[good], len(corners), NEAR_PX, now.gray.shape[1])
+    there, good = track_points(before.gray, now.gray, corners, side_px=15)
+    return _global_motion(corners[good], there[good], len(corners), NEAR_PX, now.gray.shape[1])
 
 
-def feature_link(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
+def motion_by_features(before: ImageFeatures, now: ImageFeatures) -> GlobalMotion | None:
     """The common motion of features between any two images; None if too few are found again."""
     (first, first_descriptors), (second, second_descriptors) = before.features, now.features
     if min(len(first), len(second)) < MIN_MATCHES:
         return None
     here, there = match_descriptors(first_descriptors, second_descriptors, DISTINCT)
-    return _link(first[here], second[there], len(here), LIKE_PX, now.gray.shape[1])
+    return _global_motion(first[here], second[there], len(here), LIKE_PX, now.gray.shape[1])
 
 
-def _link(a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: float, width: int) -> GlobalMotion | None:
+def _global_motion(
+    a: NDArray[np.float32], b: NDArray[np.float32], of: int, near_px: float, width: int
+) -> GlobalMotion | None:
     if len(a) < MIN_MATCHES:
         return None
     cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator
@@ -95,7 +96,7 @@ def same_view(befores: Sequence[ImageFeatures], afters: Sequence[ImageFeatures])
 
     By the features of any two, or if the nearest ones can be aligned: smooth tissue has no features.
     """
-    found = any(feature_link(before, after) is not None for before in befores for after in afters)
+    found = any(motion_by_features(before, after) is not None for before in befores for after in afters)
     return found or align(befores[0].gray, afters[0].gray) is not None
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..core.checks import check_shape
 from ..core.geometry import bilinear, pixel_centers, right_camera
 from ..core.types import Frame
-from .components import Image, Mask
+from .image_operations import Image, Mask
 from .keypoints import keypoints, match_descriptors
 
 SMALL_STEP, LARGE_STEP = 16, 64

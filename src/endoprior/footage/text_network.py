@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape, shipped_file
-from .components import HEIGHT, LEFT, TOP, WIDTH, Image, components
+from .image_operations import HEIGHT, LEFT, TOP, WIDTH, Image, components
 
 FILE = Path(__file__).with_name("text_network.onnx")
 SHA256 = "3439588c030faea393a54515f51e983d8e155b19a2e8aba7891934c1cf0de526"

@@ -1,8 +1,8 @@
 """Confirm text over several images of a clip, and follow text that moves.
 
 A box of the text detector (`text_network`) may be a highlight or a slot of a tool. Burnt-in text shows itself in
-several images, in one of two ways: it rests at one place, or it moves and keeps its size and stays level, which a tool
-does not. Text that rests may be slanted.
+several images, in one of two ways: it is static, or it moves and keeps its size and stays level, which a tool
+does not. Static text may be slanted.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .components import Image, Mask
+from .image_operations import Image, Mask
 from .text_network import TextBox
 
 MIN_SEEN = 3  # Images in which a text has to be found
 MIN_MEAN_SCORE, RARE, RARE_SCORE = 0.75, 6, 0.9
-"""Of the boxes of a text that rests: least mean score, and that of a text in fewer than `RARE` images. The slots of a
-tool that rests for a while have 0.82 in three images."""
-MAX_WANDER = 0.08  # Mean distance of the boxes of a text that rests from their line, in heights: tools have 0.2
-MIN_SHOWN_SHARE = 0.25  # Of the images from the first to the last one with a text that rests: so many show it
+"""Of the boxes of a static text: least mean score, and that of a text in fewer than `RARE` images. The slots of a
+tool that is static for a while have 0.82 in three images."""
+MAX_WANDER = 0.08  # Mean distance of the boxes of a static text from their line, in heights: tools have 0.2
+MIN_SHOWN_SHARE = 0.25  # Of the images from the first to the last one with a static text: so many show it
 SAME_PLACE = 0.7  # Boxes that share so much of the smaller one are at one place
 SAME_HEIGHT, SAME_LENGTH = 1.4, 1.25  # Largest ratios of heights, and of lengths, of one text
 LEVEL_DEGREES = 4.0  # Text that moves is level up to this
@@ -38,7 +38,7 @@ FindAtScale = Callable[[Image, float], list[TextBox]]
 
 
 @dataclass
-class Resting:
+class StaticText:
     """Text at one place. Its boxes lie on one line, and some may show a part of it."""
 
     seen: list[int] = field(default_factory=list)  # positions of the images that show it, ascending
@@ -98,31 +98,31 @@ class Resting:
 class Texts:
     """What is confirmed in a clip."""
 
-    resting: list[Resting]  # from top to bottom
+    static: list[StaticText]  # from top to bottom
     moving: list[TextBox]  # one box of each text that moves: its size
 
 
 def confirm(found: Sequence[list[TextBox]]) -> Texts:
     """The texts of a clip. Args: found: boxes of images that are spread over it, in order."""
-    places: list[Resting] = []
+    places: list[StaticText] = []
     for image, box in ((image, box) for image, boxes in enumerate(found) for box in boxes):
         here = next((place for place in places if place.holds(box)), None)
         if here is None:
-            places.append(here := Resting())
+            places.append(here := StaticText())
         here.add(image, box)
     loose = [(image, box) for image, boxes in enumerate(found) for box in boxes if _may_move(box)]
-    resting = []
+    static = []
     for place in (place for place in places if place.confirmed):
         elsewhere = {image for image, box in loose if image not in place.seen and _alike(box, place.longest)}
         if len(elsewhere) < JUMPS and not (place.comes_and_goes and _may_move(place.longest)):
-            resting.append(place)
+            static.append(place)
             loose = [(image, box) for image, box in loose if box not in place.members]
     moving: list[TextBox] = []
     for _, box in loose:
         known = any(_alike(box, other) for other in moving)
         if not known and len({image for image, other in loose if _alike(box, other)}) >= MIN_SEEN:
             moving.append(box)
-    return Texts(sorted(resting, key=lambda text: (text.box.y, text.box.x)), moving)
+    return Texts(sorted(static, key=lambda text: (text.box.y, text.box.x)), moving)
 
 
 def follow(images: Iterable[Image], moving: Sequence[TextBox], find: FindAtScale) -> list[list[TextBox]]:
@@ -155,9 +155,9 @@ def rectangle(box: TextBox, shape: tuple[int, ...]) -> tuple[int, int, int, int]
     return x, y, min(int(high[0]), shape[1]) - x, min(int(high[1]), shape[0]) - y
 
 
-def resting_rectangles(images: Sequence[Image], find: Find) -> list[tuple[int, int, int, int]]:
-    """`rectangle` of every text that rests in images (H, W, 3) of a clip, from top to bottom."""
-    return [rectangle(text.box, images[0].shape) for text in confirm([find(image) for image in images]).resting]
+def static_rectangles(images: Sequence[Image], find: Find) -> list[tuple[int, int, int, int]]:
+    """`rectangle` of every static text in images (H, W, 3) of a clip, from top to bottom."""
+    return [rectangle(text.box, images[0].shape) for text in confirm([find(image) for image in images]).static]
 
 
 def _axes(box: TextBox) -> NDArray[np.float64]:

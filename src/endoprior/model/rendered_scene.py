@@ -114,6 +114,10 @@ class RenderedScene(ABC):
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
 
+    def frame_time(self, frame: int) -> float:
+        """Time of a frame of the sequence, in [0, 1)."""
+        return frame / len(self.cameras)
+
     def camera_at(self, time: float) -> Camera:
         """Camera of the frame nearest in time."""
         nearest = round(time * len(self.cameras))

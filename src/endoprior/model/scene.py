@@ -120,7 +120,7 @@ class Scene(RenderedScene):
 
     def window_at(self, frame: int) -> tuple[SingleScene, int]:
         """The scene that shows most of a frame, and the position of that frame in it."""
-        part = max(self.shown_at(frame / len(self.cameras)), key=lambda shown: shown.weight)
+        part = max(self.shown_at(self.frame_time(frame)), key=lambda shown: shown.weight)
         return part.window.scene, frame - part.window.start
 
     def smoke_at(self, time: float) -> Tensor | None:

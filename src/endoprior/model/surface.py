@@ -56,7 +56,7 @@ def surface_points(
     points = np.empty((len(pixels), 3))
     for frame in np.unique(frames):
         own, camera = np.flatnonzero(frames == frame), scene.cameras[frame]
-        depth = depth_at(render_surface(scene, frame / len(scene.cameras), camera, min_alpha), pixels[own])
+        depth = depth_at(render_surface(scene, scene.frame_time(frame), camera, min_alpha), pixels[own])
         points[own] = back_project(pixels[own], depth, camera)
     return points
 

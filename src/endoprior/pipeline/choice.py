@@ -15,7 +15,7 @@ from typing import Any
 
 from ..core.checks import input_error
 from ..core.shell import command, command_of
-from ..footage.components import Image
+from ..footage.image_operations import Image
 from ..prepare.first_pass import source_facts
 from ..prepare.scan import scan_video
 from ..prepare.segments import Stretch, as_json, best_segment, best_start, from_json, read_scan, segments_of

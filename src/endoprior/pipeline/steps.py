@@ -34,7 +34,7 @@ from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..evaluation.verdict import Verdict, VerdictFacts, verdict_on
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
-from ..footage.components import runs
+from ..footage.image_operations import runs
 from ..footage.known_facts import KnownFacts
 from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
@@ -280,7 +280,7 @@ def _player(job: SequenceJob, progress: Progress, _handed_on: HandedOn) -> list[
     progress("packing", 0, 0)
     scene = _of_gaussians(load_scene(job.run))
     at_a_time = len(scene) / len(scene.windows)
-    left_out = {i / len(scene.cameras) for i in _frames_of(job, scene.config).left_out}
+    left_out = {scene.frame_time(i) for i in _frames_of(job, scene.config).left_out}
 
     def shown(most: float) -> list[float]:
         """Times of at most so many frames, none of which was left out of the training, if any other is there."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..footage.components import Image, Mask
+from ..footage.image_operations import Image, Mask
 from ..footage.text_network import TextBox, TextDetector
 from ..footage.texts import confirm, follow, rectangle, text_mask
 from ..system.console import ToDo
@@ -62,7 +62,7 @@ def find_text(
     found = confirm([in_view(frame.left) for frame in samples])
     boxes: dict[int, list[TextBox]] = {}
     notes = []
-    for text in found.resting:
+    for text in found.static:
         first, last = text.seen[0] - 1, text.seen[-1] + 1
         low = samples[first].index if first >= 0 else -1
         high = samples[last].index if last < len(samples) else math.inf

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..data.reading import kind_of
 from ..footage.border import CERTAIN as SHARP
-from ..footage.border import Circle, Outside, Strips, find_outline, hidden_by_moving_border
-from ..footage.components import dilated, square
+from ..footage.border import Outside, Strips, find_outline, hidden_by_moving_border
+from ..footage.image_operations import dilated, square
 from ..footage.overlays import find_strokes, without_strokes
-from ..footage.round_border import CERTAIN
+from ..footage.round_border import CERTAIN, Circle
 from ..system.console import ToDo
 from ..system.memory import cache_bytes
 from .burnt_in_text import BurntInText, find_text

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..data.description import ESTIMATED_POSES, MOTION, PATH_RECORD, intrinsics_of, read_description
+from ..data.edit import demand_writable, replace_depth, replace_poses
 from ..data.files import CONFIDENCE, list_files
 from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
 from ..data.poses import POSES, depth_bounds, pose_table, read_poses_bounds
 from ..data.scale import described_scale, without_scale
-from ..data.writer import demand_writable, replace_depth, replace_poses
 from ..footage.changes import find_changes
 from ..system.atomic import write_json
 from .camera_path.path import REFINED, CameraPath

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.found_tools import FoundTools
+from ..data.found_tools import FoundTools, found_source
 from ..data.frame_files import match_names
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import open_mask_folder
-from ..data.writer import found_source
 from ..system.atomic import whole_file
 from ..system.console import ToDo
 from ..system.parallel import frame_threads

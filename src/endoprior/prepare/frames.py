@@ -19,11 +19,20 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.ranges import evenly_spaced
 from ..data import load_sequence
-from ..data.found_tools import FrameRow, write_rows
+from ..data.found_tools import FrameRow, found_source, write_rows
 from ..data.frame_files import match_files
-from ..data.images import DEPTH_SUFFIXES, read_color, read_depth_file, read_stored, read_values, save_png
+from ..data.images import (
+    DEPTH_SUFFIXES,
+    TOOL_VALUE,
+    read_color,
+    read_depth_file,
+    read_stored,
+    read_values,
+    save_png,
+    write_tool_mask,
+)
 from ..data.pixels import is_measured
-from ..data.writer import TOOL_VALUE, FrameFiles, found_source, write_mask
+from ..data.writer import FrameFiles
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.depth_unit import guess_unit
 from ..footage.stereo_order import stereo_order, vertical_offset_px
@@ -38,7 +47,7 @@ from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
 
 if TYPE_CHECKING:
-    from ..tool_masks.mask_store import Progress
+    from ..tool_masks.tool_finder import Progress
     from ..tool_masks.video_segmenter import VideoSegmenter
 
 REACH = 2  # number of frames on each side in the temporal depth filter
@@ -342,7 +351,7 @@ def replace_by_carried(
     for i in range(files.count):
         rgb_u8 = read_color(files.file("images", i))
         mask = store.mask(i) | ~inside | methods.hidden(used[i], rgb_u8)
-        write_mask(files.file("masks", i), mask, TOOL_VALUE)
+        write_tool_mask(files.file("masks", i), mask, TOOL_VALUE)
         if methods.shade is not None:
             depth = np.where(inside, methods.shade(rgb_u8, ~mask), np.float32(0))
             save_png(files.file("depth", i), files.depth_units(depth))

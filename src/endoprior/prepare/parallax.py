@@ -24,7 +24,7 @@ from ..core.types import SURE_DEPTH
 from ..system.memory import BoundedCache, cache_bytes
 from ..system.parallel import frame_threads
 from .camera_path.tracks import PoseInput
-from .camera_path.views import EvenView, Warp, choose_partners, scaled_size
+from .camera_path.views import HighPassImage, Warp, choose_partners, scaled_size
 from .plane_sweep import FINE_WIDTH, Shot, Sweep
 
 TOLERANCE = 0.02  # relative difference of two measured depths that halves their agreement
@@ -58,7 +58,7 @@ class ParallaxDepth:
         factor = cv2.resize(self.factor[index], guess.shape[::-1], interpolation=cv2.INTER_LINEAR)
         return np.asarray(guess * factor, np.float32)
 
-    def sureness(self, index: int, size: tuple[int, int]) -> NDArray[np.uint8]:
+    def resized_confidence(self, index: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """(H, W) confidence of a frame of `size` (W, H), 0 to 255."""
         return np.asarray(cv2.resize(self.confidence[index], size, interpolation=cv2.INTER_LINEAR), np.uint8)
 
@@ -99,7 +99,8 @@ def measure_depth(
         return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (count, *shape))
 
     measured, scores = stored("inverse_depth", np.float32), stored("correlation", np.float16)
-    sureness, filled, factor = stored("confidence", np.uint8), stored("depth", np.float32), stored("factor", np.float32)
+    confidence, filled = stored("confidence", np.uint8), stored("depth", np.float32)
+    factor = stored("factor", np.float32)
     guesses, distance, tissue_px, shares = stored("guess", np.float32), *np.zeros((3, count))
     with frame_threads(BYTES_PER_PX * shape[0] * shape[1]) as pool:
         for i, found in zip(everything, pool.map(lambda i: _guessed(frame(i), small), everything), strict=True):
@@ -113,12 +114,12 @@ def measure_depth(
                 measured[i], scores[i] = found
             progress(i + 1)
         for i, found in zip(everything, pool.map(lambda i: clip.filled(i, measured, scores), everything), strict=True):
-            filled[i], sureness[i] = found[0], np.round(255 * found[1])
+            filled[i], confidence[i] = found[0], np.round(255 * found[1])
             shares[i] = (found[1] > SURE_DEPTH).sum() / max(tissue_px[i], 1.0)
         for i, found in zip(everything, pool.map(lambda i: clip.factor(i, filled), everything), strict=True):
             factor[i] = found
     share = float(shares[usable].mean()) if usable.any() else 0.0
-    return ParallaxDepth(factor, sureness, share, np.mean([bool(each) for each in partners]).item())
+    return ParallaxDepth(factor, confidence, share, np.mean([bool(each) for each in partners]).item())
 
 
 class _Clip:
@@ -130,12 +131,12 @@ class _Clip:
     ) -> None:  # fmt: skip
         self._frame, self._guesses, self._poses, self._usable = frame, guesses, poses, usable
         self._partners, self._sweep = partners, sweep
-        self._views: BoundedCache[EvenView] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
+        self._views: BoundedCache[HighPassImage] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
 
-    def view(self, i: int) -> EvenView:
-        def seen() -> EvenView:
+    def view(self, i: int) -> HighPassImage:
+        def seen() -> HighPassImage:
             frame = self._frame(i)
-            return EvenView.of(frame.rgb_u8, frame.tissue_mask, self._sweep.size)
+            return HighPassImage.of(frame.rgb_u8, frame.tissue_mask, self._sweep.size)
 
         return self._views.get(i, seen)
 

@@ -298,12 +298,13 @@ def _use_parallax(
 
     def bend(index: int) -> tuple[int, NDArray[np.uint16], NDArray[np.uint8]]:
         guess = read_depth(files.file("depth", index), meta.depth_scale)
-        return index, files.depth_units(found.depth(index, guess)), found.sureness(index, (meta.width, meta.height))
+        confidence = found.resized_confidence(index, (meta.width, meta.height))
+        return index, files.depth_units(found.depth(index, guess)), confidence
 
     with frame_threads(BYTES_PER_PX * meta.width * meta.height) as pool:
-        for index, units, sureness in pool.map(bend, range(files.count)):
+        for index, units, confidence in pool.map(bend, range(files.count)):
             save_png(files.file("depth", index), units)
-            files.write_image(CONFIDENCE, sureness, index)
+            files.write_image(CONFIDENCE, confidence, index)
     source = f"parallax on {found.share:.0%} of the tissue, filled by {meta.depth_source}"
     files.meta = replace(meta, depth_source=source, sources=meta.sources | {"depth": source})
     return [f"depth is measured by the motion of the camera: {source}"]

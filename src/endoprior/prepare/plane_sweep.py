@@ -25,7 +25,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..compute.simd import REORDERED
-from .camera_path.views import EvenView, Warp, matrix_at, scaled_size
+from .camera_path.views import HighPassImage, Warp, matrix_at, scaled_size
 
 COARSE_WIDTH, FINE_WIDTH = 128, 256  # px
 PLANES = 48
@@ -46,7 +46,7 @@ _NEAR, _ONE = np.float32(1e-3), np.float32(1)
 class Shot:
     """A frame and where its camera is."""
 
-    view: EvenView  # at the fine size
+    view: HighPassImage  # at the fine size
     pose: NDArray[np.float64]  # (4, 4) world to camera
 
 
@@ -154,8 +154,8 @@ def _add_direction(costs, dy, dx, step, jump, path, total):
 
 
 def correlation(
-    view: EvenView,
-    partners: Sequence[EvenView],
+    view: HighPassImage,
+    partners: Sequence[HighPassImage],
     warps: Sequence[Warp],
     inverse: NDArray[np.float32] | np.float32,
     window_px: int,

@@ -15,6 +15,7 @@ from ..core.checks import input_error
 from ..core.ranges import evenly_spaced
 from ..data import load_sequence
 from ..data.description import PATH_RECORD, read_description
+from ..data.edit import demand_writable, finish_scale, scaled_record, write_scale
 from ..data.images import read_depth
 from ..data.scale import (
     Scale,
@@ -24,8 +25,7 @@ from ..data.scale import (
     parse_known_length,
     scale_by_lengths,
 )
-from ..data.scale_files import finish_scale, scaled_record, write_scale
-from ..data.writer import FrameFiles, demand_writable
+from ..data.writer import FrameFiles
 from ..footage.border import find_outline, masked_border
 from .camera_path.path import CameraPath
 from .camera_path.tracks import PoseInput

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.components import Image, runs
 from ..footage.disturbances import FrameQuality, disturbances, measure_quality, scenes_outside, small_size, view_mask
+from ..footage.image_operations import Image, runs
 from ..footage.scenes import (
     JUMP,
     REACH,
@@ -22,9 +22,9 @@ from ..footage.scenes import (
     breaks,
     change,
     connected,
-    feature_link,
-    flow_link,
     jumps,
+    motion_by_features,
+    motion_by_flow,
     places_differ,
     standardized,
 )
@@ -162,7 +162,7 @@ class _Watch:
         now, found = ImageFeatures(gray, self._inside), None
         for back in (each for each in BACK if each <= len(self._views)):
             before = self._views[-back]
-            found = (flow_link(before, now) if back == 1 else None) or feature_link(before, now)
+            found = (motion_by_flow(before, now) if back == 1 else None) or motion_by_features(before, now)
             if found is not None:
                 self.pairs.append((self._count - back, self._count))
                 break

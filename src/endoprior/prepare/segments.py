@@ -11,8 +11,8 @@ import numpy as np
 
 from ..core.checks import input_error
 from ..data.reading import of_type, read_json, read_parts
-from ..footage.components import runs
 from ..footage.disturbances import FrameQuality
+from ..footage.image_operations import runs
 from .scan import Look, Scan
 
 SHORTEST_S = 1.0  # a segment is at least so long, s

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import evenly_spaced
-from ..footage.background_motion import difference_from_background
-from ..footage.components import InOrder
-from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
+from ..footage.image_operations import InOrder
+from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, difference_from_background, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
 
 COMPARED = 24  # number of frames that are compared with a later one

@@ -14,12 +14,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit
+from ..core.types import to_uint8
 from ..data import FrameSequence
 from ..evaluation.context import read_frame_scores, read_scores
 from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
-from ..visualization.image_tools import colorize, save_figure, to_u8
+from ..visualization.image_tools import colorize, save_figure
 from ..visualization.rendered_views import depth_span, tissue_distance, turned
 from ..visualization.tissue_layers import PaintedTissue, SupportMap
 from .folder import LOG
@@ -73,7 +74,7 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
         out = scene.render_with_smoke(frame.time, frame.camera)
         color, depth = out.color.cpu().numpy(), out.depth.cpu().numpy()
         error = np.abs(color - frame.rgb).mean(-1)
-        cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered", to_u8(color))]
+        cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered", to_uint8(color))]
         tissue = sequence.truth.tissue(frame.index) if sequence.truth else None
         if tissue is not None:
             cells.append(("true tissue", tissue))
@@ -95,16 +96,16 @@ def _side_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[
     for degrees in TURNS_DEG:
         out = scene.render(frame.time, turned(frame.camera, degrees, distance))
         side = "right" if degrees > 0 else "left"
-        cells.append((f"frame {frame.index} from {abs(degrees)} degrees {side}", to_u8(out.color.cpu().numpy())))
+        cells.append((f"frame {frame.index} from {abs(degrees)} degrees {side}", to_uint8(out.color.cpu().numpy())))
     marked = SupportMap(scene, sequence.training_part).render(frame.time, frame.camera)
-    return [*cells, (marked.legend, to_u8(marked.color))]
+    return [*cells, (marked.legend, to_uint8(marked.color))]
 
 
 def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:
     painted, cells = PaintedTissue(scene), []
     for index in (0, len(sequence) // 2, len(sequence) - 1):
         frame = sequence.frame(index)
-        color = to_u8(painted.render(frame.time, frame.camera))
+        color = to_uint8(painted.render(frame.time, frame.camera))
         if index:
             cells.append((f"input, frame {index}", frame.rgb_u8))
         cells.append((f"grid carried to frame {index}" if index else "grid on frame 0", color))

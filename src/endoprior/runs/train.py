@@ -18,7 +18,7 @@ from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config
 from ..core.types import Fingerprints
 from ..data import FrameSequence, check_sequence, load_sequence
-from ..data.window_plan import look_through, plan_windows
+from ..data.window_plan import plan_windows, summarize_frames
 from ..model.method import method_of
 from ..model.scene import RenderedScene, SingleScene
 from ..model.scene_file import load_scene
@@ -162,8 +162,8 @@ def _checked_run(
     if cfg.windows.longest:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         # Else looked at through a view with a cache of its own, which is freed.
-        looks = sequence.looks or look_through(sequence.part(0, len(sequence)))
-        plan = plan_windows(cameras, looks, cfg.windows.longest)
+        summaries = sequence.summaries or summarize_frames(sequence.part(0, len(sequence)))
+        plan = plan_windows(cameras, summaries, cfg.windows.longest)
         if len(plan) > 1 and not method_of(cfg).has_gaussians:
             want, got = f"0 with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
             raise input_error("windows.longest", want, got, "Add --windows.longest 0.")

@@ -1,6 +1,6 @@
 """Find surgical tools in the frames of a clip, with a small network that comes with the program."""
 
 from ..data.found_tools import FoundTools
-from .network import ToolFinder
+from .tool_finder import ToolFinder
 
 __all__ = ["FoundTools", "ToolFinder"]

@@ -23,13 +23,13 @@ from ..core.checks import input_error
 from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..footage.carry_masks import sampled
-from ..footage.components import AREA, Mask, components, large_regions, regions_where
+from ..footage.image_operations import AREA, Mask, components, large_regions, regions_where
 from ..footage.optical_flow import MIN_SIZE_PX, flow_pair, gray_for_flow
 from .examples import Examples, clicked_region, examples_of, feature_map, fit
-from .mask_store import SAMPLES, view_of
-from .network import ToolFinder, full_size, network_image, small_view
+from .network import full_size, network_image, small_view
 from .over_time import MAX_LOG_ODDS
 from .regions import tool_regions
+from .tool_finder import ToolFinder, view_of
 
 TAUGHT = 12  # Number of frames, besides the clicked ones, from which examples are taken
 MIN_PART_PX = 30
@@ -100,10 +100,10 @@ def _steps(
     sequence: FrameSequence, clicks: Sequence[ToolClick], tool: Callable[[int], Mask], finder: ToolFinder
 ) -> Iterator[SearchStep]:
     count = len(sequence)
-    view = view_of([sequence.frame(i) for i in evenly_spaced(count, SAMPLES)])
+    view = view_of(sequence)
     small = small_view(view)
 
-    def look(index: int) -> tuple[NDArray[np.float32], Mask]:
+    def features_of(index: int) -> tuple[NDArray[np.float32], Mask]:
         """The features (h, w, k) of a frame, and (h, w) True on its masked tools."""
         rgb_u8, known = sequence.frame(index).rgb_u8, (tool(index) & view).astype(np.float32)
         known = cv2.resize(known, small.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
@@ -112,7 +112,7 @@ def _steps(
     taught = sorted({*evenly_spaced(count, TAUGHT), *(click.frame for click in clicks)})
     total, regions, examples = len(taught) + count, dict[int, Mask](), list[Examples]()
     for done, i in enumerate(taught, 1):
-        features, known = look(i)
+        features, known = features_of(i)
         free = small & ~known
         here = [spot for click in clicks if click.frame == i and (spot := _spot(click, free, view.shape))]
         clicked = np.any([np.zeros_like(known), *(clicked_region(features, free, spot) for spot in here)], axis=0)
@@ -122,7 +122,7 @@ def _steps(
         yield SearchStep(done, total)
     classifier = fit(examples)
     for i in range(count):
-        features, known = look(i)
+        features, known = features_of(i)
         # Known tools count as certain, so that a part which touches one enters the view with it.
         odds = np.clip(classifier.log_odds(features), -MAX_LOG_ODDS, MAX_LOG_ODDS)
         found = np.where(known, MAX_LOG_ODDS, odds).astype(np.float32)
@@ -166,7 +166,7 @@ def _tissue_steps(
     sequence: FrameSequence, clicks: Sequence[ToolClick], tool: Callable[[int], Mask]
 ) -> Iterator[SearchStep]:
     count, done = len(sequence), 0
-    view = view_of([sequence.frame(i) for i in evenly_spaced(count, SAMPLES)])
+    view = view_of(sequence)
     for click in clicks:
         labels, _ = components(tool(click.frame) & view)
         clicked = (labels == labels[int(click.y), int(click.x)]) & (labels > 0)

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import evenly_spaced
-from ..footage.components import Mask, components, dilated, disk
+from ..footage.image_operations import Mask, components, dilated, disk
 
 SURE = 4.0  # Log-odds count up to this, so that examples can outweigh a network that is sure and wrong
 COLORS = 5  # Channels of the network's image: color, two color ratios
 SMOOTH_PX, CONTRAST_PX = 1.0, 2.0  # Standard deviations of the windows of color and contrast
 MIN_CONTRAST = 0.02  # Added before the logarithm: about the noise of a color of [-1, 1]
-LOOK = slice(0, 1 + COLORS)
+APPEARANCE = slice(0, 1 + COLORS)
 """The features by which a region of one tool is told from what is beside it: all but the contrast."""
 MAX_REGION = 0.08  # Largest region of one click, as a share of the view: larger ones have run over tissue
 MIN_REGION_PX = 20  # Smaller regions are not compared: their outlines are rough
@@ -39,7 +39,7 @@ TISSUE, TISSUE_IN_CLICKED, TOOL = 400, 1600, 200
 CLICKED_WEIGHT, CLICKED_MOST, TOOL_WEIGHT = 0.5, 300.0, 0.3
 """Weight of a clicked pixel, of all of them together at most, and of a pixel that is masked already. Tissue weighs 1:
 to take tissue for a tool is worse than to miss a part, which another click finds."""
-LOOKS_CLICKED = 0.7  # Tissue of a higher probability is no example: it is likely the clicked tool in another frame
+MAX_TISSUE_PROBABILITY = 0.7  # Tissue above it is no example: it is likely the clicked tool in another frame
 ROUNDS = 2
 RIDGE = 1.0
 MAX_STEPS = 20
@@ -80,16 +80,16 @@ def feature_map(log_odds: NDArray[np.float32], image: NDArray[np.float32]) -> ND
 
 
 def clicked_region(features: NDArray[np.float32], free: Mask, spot: tuple[int, int]) -> Mask:
-    """(h, w) the region of one look around a click at (column, row), in the view beside known tools: `free`, (h, w)."""
+    """(h, w) the region of one appearance around a click at (column, row), in the view beside known tools, `free`."""
     x, y = spot
     if not free[y, x]:
         raise ValueError(f"spot must be where the region can be; got {spot}")
-    look = features[..., LOOK]
-    scale = look[free].std(0) + 1e-6
+    appearance = features[..., APPEARANCE]
+    scale = appearance[free].std(0) + 1e-6
     seed = np.zeros_like(free)
     seed[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2] = True
     seed &= free
-    difference = np.sqrt((((look - look[seed].mean(0)) / scale) ** 2).mean(-1))
+    difference = np.sqrt((((appearance - appearance[seed].mean(0)) / scale) ** 2).mean(-1))
     difference = cv2.GaussianBlur(difference.astype(np.float32), (0, 0), 0.8)
     regions: list[Mask] = []
     for most in np.linspace(difference[y, x] + 0.02, FARTHEST, NUM_THRESHOLDS):
@@ -141,7 +141,7 @@ def fit(frames: Sequence[Examples]) -> Classifier:
         normal = (features[kept] - mean) / scale
         offset = features[kept, 0].astype(np.float64)
         classifier = Classifier(mean, scale, fit_logistic(normal, is_tool[kept], weight[kept], offset, RIDGE))
-        kept = is_tool | (probability(classifier.log_odds(features)) < LOOKS_CLICKED)
+        kept = is_tool | (probability(classifier.log_odds(features)) < MAX_TISSUE_PROBABILITY)
     return classifier
 
 

@@ -1,11 +1,8 @@
-"""Find the tools in all frames of a sequence folder. Their masks are kept, one small PNG per frame, with what has been
-done, so that the search can be resumed.
-"""
+"""Masks that are being made, one small PNG per frame, and what has been done, so that the search can be resumed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +10,10 @@ import numpy as np
 
 from ..core.checks import InputError
 from ..core.config_io import value_of
-from ..core.ranges import evenly_spaced
-from ..core.types import Frame
-from ..data import FrameSequence
-from ..data.found_tools import FoundTools, FrameRow
-from ..data.images import read_tool_mask, save_png
-from ..footage.border import find_outline, masked_border
-from ..footage.components import Mask, components, regions_where
-from ..system.atomic import read_json_object, whole_file, write_json
-from .network import ToolFinder, full_size
+from ..data.found_tools import FrameRow
+from ..data.images import read_tool_mask, write_tool_mask
+from ..footage.image_operations import Mask
+from ..system.atomic import read_json_object, write_json
 
 STATE = "state.json"
 TYPES = {"rows": tuple[FrameRow, ...], "confidence": tuple[float, ...], "carried": tuple[str, ...]}
@@ -55,8 +47,7 @@ class MaskStore(Mapping[int, Mask]):
 
     def put(self, index: int, mask: Mask) -> None:
         """Write the mask (H, W) of a frame."""
-        with whole_file(self._file(index)) as temporary:
-            save_png(temporary, np.where(mask, 255, 0).astype(np.uint8))
+        write_tool_mask(self._file(index), mask)
 
     def add(self, index: int, mask: Mask) -> None:
         """Add the pixels of a mask (H, W) to that of a frame. To add them twice changes nothing."""
@@ -79,39 +70,3 @@ def read_state(folder: Path) -> dict[str, Any]:
 def write_state(folder: Path, state: dict[str, Any]) -> None:
     """Note what has been done."""
     write_json(folder / STATE, state)
-
-
-SAMPLES = 16  # Number of frames from which the border of the view is taken
-Progress = Callable[[str, int, int], None]
-
-
-def no_progress(_what: str, _done: int, _total: int) -> None:
-    """Report nothing."""
-
-
-def find_in_sequence(
-    sequence: FrameSequence, *, refine: bool = False, progress: Progress = no_progress
-) -> Iterator[tuple[Mask, FoundTools]]:
-    """Find the tools of every frame, in order: (H, W) True on everything that is not tissue, as a mask file stores it,
-    and the tools of the frame. `refine` only adds pixels to the sequence's masks, in regions that touch them.
-    """
-    total, finder = len(sequence), ToolFinder()
-    view = view_of([sequence.frame(i) for i in evenly_spaced(total, SAMPLES)])
-    images = (sequence.frame(i).rgb_u8 for i in range(total))
-    for i, small in enumerate(finder.find_over_time(images, view)):
-        frame, found = sequence.frame(i), replace(small, tool_mask=full_size(small.tool_mask, view.shape) & view)
-        if refine:
-            given = ~frame.tissue_mask & view
-            labels, boxes = components(given | found.tool_mask)
-            touches = np.isin(np.arange(len(boxes)), labels[given])
-            found = FoundTools(regions_where(touches, labels), found.confidence)
-        progress("finding tools", i + 1, total)
-        yield found.tool_mask | ~view, found
-
-
-def view_of(frames: Sequence[Frame]) -> Mask:
-    """(H, W) True inside the endoscope's image: not beyond its border, and not masked and black in all frames."""
-    images = [frame.rgb_u8 for frame in frames]
-    outline = find_outline(images)
-    masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
-    return ~(outline.in_strip | outline.outside | masked)

@@ -3,12 +3,11 @@
 It sees one frame, so it needs neither motion nor a second frame; `h, w` is the size of the image that it gets, whose
 longer side is `LONG_SIDE_PX`. Its weights are a file in the package, checked against its digest; docs/tool_network.md
 says how they were made. Nothing is fitted to a clip: a tool that rests is found as well as one that moves. `H, W` is
-the size of the whole image. The masks are a starting point: correct them in the viewer, or pass your own.
+the size of the whole image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,10 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ..core.checks import check_shape, shipped_file
-from ..data.found_tools import FoundTools
-from ..footage.components import Image, InOrder, Mask
-from .over_time import Look, decide_over_time
-from .regions import tool_regions
+from ..footage.image_operations import Image, Mask
 
 FILE = Path(__file__).with_name("tool_network.safetensors")
 SHA256 = "354f24d519af9bd2c7d48540de993a97c7b66a17e932575d7cdd99939c1d1cde"
@@ -173,65 +169,6 @@ def weights_of(network: ToolNetwork) -> bytes:
     return save({name: value.half().contiguous() for name, value in state.items() if value.is_floating_point()})
 
 
-MAYBE = 0.25  # Pixels of a higher probability may be a tool: they count in the confidence
-MIN_DOUBT = 0.004  # Share of the view in doubt from which on a frame without a mask is uncertain
-
-
-class ToolFinder:
-    """Finds the tools of single frames, and of clips."""
-
-    def __init__(self, network: ToolNetwork | None = None) -> None:
-        """Take a network in place of the one that comes with the program."""
-        self._network = network or shipped_network()
-
-    def log_odds(self, rgb_u8: Image, view: Mask, turned: bool = True) -> NDArray[np.float32]:
-        """(h, w) log-odds of a tool of a frame (H, W, 3) in the view (H, W).
-
-        Args:
-            turned: mean over the frame and itself turned by 180 degrees, which is steadier and takes twice as long.
-        """
-        image = torch.from_numpy(network_image(rgb_u8, view))
-        h, w = image.shape[1:]
-        flips = ((), (-1, -2)) if turned else ((),)
-        images = torch.stack([image.flip(flip) for flip in flips])
-        images = torch.nn.functional.pad(images, (0, -w % MULTIPLE, 0, -h % MULTIPLE))
-        with torch.inference_mode():
-            found = self._network(images.contiguous(memory_format=torch.channels_last))[:, :h, :w]
-        return torch.stack([one.flip(flip) for one, flip in zip(found, flips, strict=True)]).mean(0).numpy()
-
-    def find(self, rgb_u8: Image, view: Mask) -> FoundTools:
-        """Find the tools of one frame; arguments as in `log_odds`."""
-        if not view.any():
-            return FoundTools(np.zeros_like(view), 1.0)
-        log_odds, small = self.log_odds(rgb_u8, view), small_view(view)
-        mask = tool_regions(log_odds, small)
-        return FoundTools(full_size(mask, view.shape) & view, _confidence(mask, log_odds, small))
-
-    def find_over_time(self, images: Iterable[Image], view: Mask, each: InOrder = map) -> Iterator[FoundTools]:
-        """Find the tools of all frames of a clip, (h, w) at the network's size: see `full_size`.
-
-        Args:
-            images: (H, W, 3), in order. view: (H, W).
-            each: as `map`; threads can look at the images, in order.
-        """
-        small = small_view(view)
-
-        def look(rgb_u8: Image) -> Look:
-            shrunk = cv2.resize(rgb_u8, small.shape[::-1], interpolation=cv2.INTER_AREA)
-            return Look(np.asarray(shrunk, np.uint8), self.log_odds(rgb_u8, view))
-
-        for tools in decide_over_time(each(look, images), small):
-            yield FoundTools(tools.tool_mask, _confidence(tools.tool_mask, tools.log_odds, small))
-
-
-def _confidence(mask: Mask, log_odds: NDArray[np.float32], view: Mask) -> float:
-    """That of `FoundTools`, from (h, w) arrays."""
-    probability = 1 / (1 + np.exp(-log_odds))
-    maybe = probability[(mask | (probability > MAYBE)) & view]
-    enough = mask.any() or maybe.size > MIN_DOUBT * view.sum()
-    return float(np.abs(2 * maybe - 1).mean()) if enough else 1.0
-
-
 def network_size(shape: tuple[int, ...]) -> tuple[int, int]:
     """(w, h) of the network's image for frames of (H, W)."""
     scale = LONG_SIDE_PX / max(shape)
@@ -239,7 +176,7 @@ def network_size(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def network_image(rgb_u8: Image, view: Mask) -> NDArray[np.float32]:
-    """(6, h, w) what the network sees of a frame; arguments as in `ToolFinder.log_odds`."""
+    """(6, h, w) what the network sees of a frame; arguments as in `ToolFinder.log_odds` of `tool_finder`."""
     check_shape("rgb_u8:H,W,3 view:H,W", rgb_u8=rgb_u8, view=view)
     small = cv2.resize(rgb_u8, network_size(view.shape), interpolation=cv2.INTER_AREA)
     return network_input(np.asarray(small, np.uint8), small_view(view))

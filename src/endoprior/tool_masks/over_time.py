@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..footage.carry_masks import sampled
-from ..footage.components import Image, Mask
+from ..footage.image_operations import Image, Mask
 from ..footage.optical_flow import MIN_SIZE_PX, flow_pair
 from .regions import candidate_regions, joined
 
@@ -32,8 +32,8 @@ Values = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Look:
-    """What is known of one frame alone."""
+class FramePrediction:
+    """What the network predicts of one frame alone."""
 
     rgb_u8: Image  # (h, w, 3)
     log_odds: Values  # (h, w) of a tool
@@ -47,11 +47,11 @@ class SmallTools:
     log_odds: Values  # (h, w) carried over time
 
 
-def decide_over_time(looks: Iterable[Look], view: Mask) -> Iterator[SmallTools]:
+def decide_over_time(predictions: Iterable[FramePrediction], view: Mask) -> Iterator[SmallTools]:
     """The tools of each frame of a clip, in order. Args: view: (h, w) True inside the endoscope's image."""
-    waiting, first = list[Look](), 0  # `first` of them are decided and kept as a margin
-    for look in looks:
-        waiting.append(look)
+    waiting, first = list[FramePrediction](), 0  # `first` of them are decided and kept as a margin
+    for prediction in predictions:
+        waiting.append(prediction)
         if len(waiting) == first + CHUNK + MARGIN:
             yield from _decided(waiting, view)[first : first + CHUNK]
             gone = max(first + CHUNK - MARGIN, 0)
@@ -60,12 +60,12 @@ def decide_over_time(looks: Iterable[Look], view: Mask) -> Iterator[SmallTools]:
         yield from _decided(waiting, view)[first:]
 
 
-def _decided(looks: list[Look], view: Mask) -> list[SmallTools]:
-    links = [BidirectionalFlow.between(before, after) for before, after in pairwise(looks)]
-    odds = carried([np.clip(look.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS) for look in looks], links)
+def _decided(predictions: list[FramePrediction], view: Mask) -> list[SmallTools]:
+    flows = [BidirectionalFlow.between(before, after) for before, after in pairwise(predictions)]
+    odds = carried([np.clip(each.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS) for each in predictions], flows)
     regions = [candidate_regions(each, view) for each in odds]
     taken = [np.any([np.zeros_like(view), *(r.mask for r in found if r.is_tool)], axis=0) for found in regions]
-    agreed = carried([mask.astype(np.float32) for mask in taken], links, MIN_TRUST)
+    agreed = carried([mask.astype(np.float32) for mask in taken], flows, MIN_TRUST)
     return [
         SmallTools(joined([r.mask for r in found if share[r.mask].mean() > AGREED], each, view), each)
         for found, share, each in zip(regions, agreed, odds, strict=True)
@@ -82,12 +82,12 @@ class BidirectionalFlow:
     trust_before: Values
 
     @classmethod
-    def between(cls, before: Look, after: Look) -> BidirectionalFlow:
+    def between(cls, before: FramePrediction, after: FramePrediction) -> BidirectionalFlow:
         shape = before.log_odds.shape
         grid = np.dstack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1])))
         onward = back = np.zeros_like(grid)
         if min(shape) >= MIN_SIZE_PX:
-            grays = (cv2.cvtColor(look.rgb_u8, cv2.COLOR_RGB2GRAY) for look in (before, after))
+            grays = (cv2.cvtColor(each.rgb_u8, cv2.COLOR_RGB2GRAY) for each in (before, after))
             onward, back = flow_pair(*(np.asarray(gray, np.uint8) for gray in grays))
         colors = [cv2.GaussianBlur(each.rgb_u8.astype(np.float32), (0, 0), COLOR_BLUR_PX) for each in (before, after)]
 
@@ -100,14 +100,14 @@ class BidirectionalFlow:
         return cls(grid + back, grid + onward, behind, ahead)
 
 
-def carried(values: list[Values], links: list[BidirectionalFlow], least_trust: float = 0.0) -> list[Values]:
+def carried(values: list[Values], flows: list[BidirectionalFlow], least_trust: float = 0.0) -> list[Values]:
     """(h, w) weighted mean of each frame's values and those of the frames around, carried along the flow."""
 
     def step(places: NDArray[np.float32], trust: Values) -> tuple[NDArray[np.float32], Values]:
         return places, least_trust + (1 - least_trust) * trust
 
-    ahead = _one_way(values, [step(link.to_before, link.trust_after) for link in links])
-    behind = _one_way(values[::-1], [step(link.to_after, link.trust_before) for link in links[::-1]])[::-1]
+    ahead = _one_way(values, [step(flow.to_before, flow.trust_after) for flow in flows])
+    behind = _one_way(values[::-1], [step(flow.to_after, flow.trust_before) for flow in flows[::-1]])[::-1]
     # Both sums hold the frame itself.
     return [
         ((a[..., 0] + b[..., 0] - own) / (a[..., 1] + b[..., 1] - 1)).astype(np.float32)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.components import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, components, dilated, disk, regions_where
+from ..footage.image_operations import AREA, HEIGHT, LEFT, TOP, WIDTH, Mask, components, dilated, disk, regions_where
 
 LEVELS = np.arange(-0.6, 4.01, 0.5)  # of the log-odds, at which regions may end: probabilities from 0.35 to 0.98
 STABLE = 0.8  # Share of a region that the next level leaves of one with an outline

@@ -17,8 +17,9 @@ import numpy as np
 
 from ..data import FrameSequence
 from ..data.found_tools import FoundTools
-from ..footage.components import AREA, Image, Mask, components, dilated, disk
-from .mask_store import MaskStore, Progress, find_in_sequence, no_progress, read_state, write_state
+from ..footage.image_operations import AREA, Image, Mask, components, dilated, disk
+from .mask_store import MaskStore, read_state, write_state
+from .tool_finder import Progress, find_in_sequence, no_progress
 
 ROUNDS = 2
 AGREEMENT = 0.5

@@ -26,7 +26,7 @@ from .losses import supervised_terms
 from .method import Method
 from .ops import TrainingOps
 from .optimizer import Rate, rate_of
-from .state import Drawn
+from .state import ForwardPass
 from .trainer import Stage
 
 EPOCHS = 2**31  # keeps the random numbers of epochs apart from those of iterations
@@ -76,11 +76,11 @@ class GaussianHooks(Method):
         return in_epochs(cfg.seed, stage, iteration, num_frames)
 
     def context(self, frames: TrainingFrames, cfg: Config) -> Any:
-        """What the loss needs of all training frames, made once: `Drawn.context`."""
+        """What the loss needs of all training frames, made once: `ForwardPass.context`."""
 
-    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+    def terms(self, forward: ForwardPass, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         """The weighted terms of the loss, () each."""
-        return supervised_terms(drawn.out, drawn.frame, cfg.loss, ops.supervised_losses)
+        return supervised_terms(forward.out, forward.frame, cfg.loss, ops.supervised_losses)
 
     def density_due(self, stage: Stage, iteration: int, last: bool, cfg: Config) -> bool:
         """Whether Gaussians are cloned, split and removed after this iteration; `last`: of the stage."""

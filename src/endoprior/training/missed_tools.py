@@ -20,12 +20,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..core.ranges import evenly_spaced
 from ..data import FrameSequence
 from ..system.memory import BoundedCache, cache_bytes
 from ..tool_masks import ToolFinder
-from ..tool_masks.mask_store import view_of
 from ..tool_masks.regions import disk, entering_regions, filled
+from ..tool_masks.tool_finder import view_of
 from .frames import TrainingFrame
 
 WORK_PX = 160  # longer side of the resized image, px: a shaft is about 12 px wide, a jaw 3
@@ -84,9 +83,7 @@ class MissedToolFinder:
     """Finds the pixels of training frames that show a tool in spite of the mask."""
 
     def __init__(self, sequence: FrameSequence) -> None:
-        indices = sequence.indices("train")
-        frames = [sequence.frame(indices[k]) for k in evenly_spaced(len(indices), SAMPLES)]
-        self._sequence, self._view = sequence, view_of(frames)
+        self._sequence, self._view = sequence, view_of(sequence, "train", SAMPLES)
         self._finder = ToolFinder()
         height, width = self._view.shape
         scale = WORK_PX / max(height, width)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.types import Frame
+from ..core.types import Frame, to_uint8
 from ..model.photometric import GRID
 from ..system.memory import workers
 
@@ -53,8 +53,8 @@ def resized(frame: Frame) -> Small:
 
 
 @dataclass(frozen=True)
-class Looks:
-    """What smoke changes in the looks of frames, (F,) each, smoothed over time."""
+class HazeStatistics:
+    """What smoke changes in frames, (F,) each, smoothed over time."""
 
     gray: NDArray[np.float64]
     """Smallest over largest channel of the tissue, 0 to 1: smoke adds about the same light to all channels."""
@@ -74,7 +74,7 @@ class Looks:
         return np.maximum(np.minimum(rise / HAZY_GRAY, loss / HAZY_LOSS), 0)
 
 
-def looks_of(frames: Sequence[Small]) -> Looks:
+def haze_statistics(frames: Sequence[Small]) -> HazeStatistics:
     """Measure frames, in the order of time."""
     gray, contrast = [], []
     for square, weight in frames:
@@ -87,7 +87,7 @@ def looks_of(frames: Sequence[Small]) -> Looks:
         contrast.append(float((weight * ratio).sum() / max(weight.sum(), 1e-6)))
         lowest, highest = (float((values * weight).sum()) for values in (square.min(-1), square.max(-1)))
         gray.append(np.sqrt(lowest / max(highest, 1e-6)))
-    return Looks(_smoothed(gray), _smoothed(contrast))
+    return HazeStatistics(_smoothed(gray), _smoothed(contrast))
 
 
 def _smoothed(values: Sequence[float]) -> NDArray[np.float64]:
@@ -95,9 +95,9 @@ def _smoothed(values: Sequence[float]) -> NDArray[np.float64]:
     return (padded[:-2] + padded[1:-1] + padded[2:]) / 3
 
 
-def smoke_needed(looks: Looks) -> bool:
+def smoke_needed(statistics: HazeStatistics) -> bool:
     """Whether frames show so much smoke at times that it needs a model."""
-    return bool(looks.haze.max() >= 1)
+    return bool(statistics.haze.max() >= 1)
 
 
 def smoke_of(frames: Sequence[Frame], wanted: str) -> NDArray[np.float32] | None:
@@ -111,17 +111,17 @@ def smoke_of(frames: Sequence[Frame], wanted: str) -> NDArray[np.float32] | None
     bytes_each = 64 * frames[0].tissue_mask.size  # of a frame while it is decoded and resized
     with ThreadPoolExecutor(workers(bytes_each)) as pool:
         small = list(pool.map(lambda k: resized(frames[k]), range(len(frames))))
-    looks = looks_of(small)
-    return fitted_grids(small, looks) if wanted == "smoke" or smoke_needed(looks) else None
+    statistics = haze_statistics(small)
+    return fitted_grids(small, statistics) if wanted == "smoke" or smoke_needed(statistics) else None
 
 
-def fitted_grids(frames: Sequence[Small], looks: Looks) -> NDArray[np.float32]:
+def fitted_grids(frames: Sequence[Small], statistics: HazeStatistics) -> NDArray[np.float32]:
     """(F, I, J, 2) gain and veil of frames, in the order of time.
 
     Each frame is compared with a running mean of those before it, freed of smoke. Between two frames tissue and camera
     move little, at this resolution.
     """
-    neutral, first = np.zeros((*GRID, 2), np.float32), looks.clearest
+    neutral, first = np.zeros((*GRID, 2), np.float32), statistics.clearest
     neutral[..., 0] = 1
     grids = np.stack([neutral] * len(frames))
     for order in (range(first + 1, len(frames)), range(first - 1, -1, -1)):
@@ -135,7 +135,7 @@ def fitted_grids(frames: Sequence[Small], looks: Looks) -> NDArray[np.float32]:
             known = np.maximum(known, weight)
     clear = np.exp(-grids[..., 1].mean((1, 2)) / CLEAR)
     grids[..., 0] /= np.exp(clear @ np.log(grids[..., 0]).mean((1, 2)) / clear.sum())
-    smoky = np.minimum(looks.haze, 1).astype(np.float32)[:, None, None, None]
+    smoky = np.minimum(statistics.haze, 1).astype(np.float32)[:, None, None, None]
     return np.asarray(
         smoky * grids + (1 - smoky) * neutral, np.float32
     )  # frames that look like the clearest one have none
@@ -172,7 +172,7 @@ def cleared(frame: Frame, grid: NDArray) -> Frame:
     """The frame without the smoke that its coefficients (I, J, 2) say: where Gaussians start."""
     gain, veil = of_pixels(grid, frame.tissue_mask.shape)
     color = np.sqrt(np.maximum(frame.rgb**2 - veil[..., None], 0) / gain[..., None])
-    return replace(frame, rgb_u8=(np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8))
+    return replace(frame, rgb_u8=to_uint8(color))
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Before(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ForwardPass:
     """A training frame that was rendered, and what it was rendered from: what the loss of a method sees."""
 
     stage: Stage

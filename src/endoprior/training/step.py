@@ -27,7 +27,7 @@ from .gaussian_hooks import GaussianHooks
 from .losses import color_l1
 from .missed_tools import START, MissedToolFinder, missed_tool_frames, record_visit
 from .ops import TrainingOps
-from .state import Before, Drawn, GaussiansState
+from .state import Before, ForwardPass, GaussiansState
 from .temporal import temporal_terms
 from .trainer import Stage, StepReport, stage_length
 
@@ -76,11 +76,11 @@ class TrainingStep:
         # After the last iteration nothing would train the lowered opacities again.
         reset = method.reset_due(state.stage, iteration, cfg) and not (fine and last)
 
-        drawn = self.draw(state, rng)
-        terms, color_error = self.loss(state, drawn)
+        forward = self.forward(state, rng)
+        terms, color_error = self.loss(state, forward)
         loss = sum(terms.values(), torch.zeros(()))
         loss.backward()
-        unusable, empty_error = state.optimizer.count_unusable(), method.empty_error(drawn.frame.brightness)
+        unusable, empty_error = state.optimizer.count_unusable(), method.empty_error(forward.frame.brightness)
         wait = densify or reset or last
         try:
             self.check.after_backward(iteration, terms, unusable, color_error, empty_error, wait=wait)
@@ -90,8 +90,8 @@ class TrainingStep:
             raise
         event: dict[str, int] | None = None
         with torch.no_grad():
-            self._observe(state, drawn)
-            self._update(state, drawn)
+            self._observe(state, forward)
+            self._update(state, forward)
             state.iteration = iteration  # what follows may raise, and must leave a state that can be resumed
             if densify:
                 event = self._densify(state, iteration, rng)
@@ -104,7 +104,7 @@ class TrainingStep:
             missed = missed_tool_frames(state.left_out, self.frames.indices)
         return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, missed)
 
-    def draw(self, state: GaussiansState, rng: np.random.Generator) -> Drawn:
+    def forward(self, state: GaussiansState, rng: np.random.Generator) -> ForwardPass:
         """Batch, deform, render; nothing is changed.
 
         Args:
@@ -145,7 +145,7 @@ class TrainingStep:
         if self.missed_tools and fine and not is_right and self._knows_tissue(state):
             compared = self.missed_tools.without_tools(frame, out.color)
             left_out = self.missed_tools.share(frame, compared)
-        return Drawn(
+        return ForwardPass(
             stage=state.stage,
             iteration=iteration,
             position=position,
@@ -167,40 +167,40 @@ class TrainingStep:
         late = state.iteration + 1 > START * stage_length(self.cfg, Stage.FINE)
         return late or (state.left_out is not None and bool(state.left_out.any()))
 
-    def loss(self, state: GaussiansState, drawn: Drawn) -> tuple[dict[str, Tensor], Tensor]:
+    def loss(self, state: GaussiansState, forward: ForwardPass) -> tuple[dict[str, Tensor], Tensor]:
         """Weighted terms, () each; and the mean absolute color error over tissue, (), that the check watches."""
-        cfg, frame = self.cfg, drawn.frame
-        terms = self.method.terms(drawn, cfg, self.ops)  # ours: `losses.supervised_terms`
+        cfg, frame = self.cfg, forward.frame
+        terms = self.method.terms(forward, cfg, self.ops)  # ours: `losses.supervised_terms`
         _check_terms(terms, cfg)
         is_error = self.method.color_is_error
-        error = terms["color"] if is_error else color_l1(drawn.out.color.detach(), frame.rgb, frame.tissue_mask)
-        if drawn.offsets is not None and state.tracks is not None:
-            means, moved = drawn.gaussians["means"], drawn.offsets.means
-            term = self.ops.track_term(means, moved, state.tracks, frame, drawn.position)
+        error = terms["color"] if is_error else color_l1(forward.out.color.detach(), frame.rgb, frame.tissue_mask)
+        if forward.offsets is not None and state.tracks is not None:
+            means, moved = forward.gaussians["means"], forward.offsets.means
+            term = self.ops.track_term(means, moved, state.tracks, frame, forward.position)
             terms |= {"track": cfg.loss.track_weight * term}
-        if drawn.before is not None:
-            terms |= temporal_terms(drawn, drawn.before, self.motion, state.stats, cfg, self.ops)
+        if forward.before is not None:
+            terms |= temporal_terms(forward, forward.before, self.motion, state.stats, cfg, self.ops)
         return terms, error
 
-    def _observe(self, state: GaussiansState, drawn: Drawn) -> None:
+    def _observe(self, state: GaussiansState, forward: ForwardPass) -> None:
         """Add to the running statistics: the gradient always, the prior's score where it is sampled."""
-        camera, skip, cfg = drawn.frame.camera, self.check.skip, self.cfg.density
-        self.ops.add_gradient(state.stats, drawn.out, camera.width, camera.height, skip)
-        sampled = not self.cfg.released.prior or density.due(drawn.iteration, False, cfg)
-        if sampled and self.method.uses_prior and not drawn.is_right:
-            prior, tissue_mask = self.frames.prior(drawn.position)
+        camera, skip, cfg = forward.frame.camera, self.check.skip, self.cfg.density
+        self.ops.add_gradient(state.stats, forward.out, camera.width, camera.height, skip)
+        sampled = not self.cfg.released.prior or density.due(forward.iteration, False, cfg)
+        if sampled and self.method.uses_prior and not forward.is_right:
+            prior, tissue_mask = self.frames.prior(forward.position)
             scale, opacities = prior.shape[1] / camera.width, state.gaussians.opacities
-            self.ops.add_score(state.stats, drawn.out, prior, tissue_mask, opacities, scale, skip)
-        if state.left_out is not None and drawn.left_out is not None:
-            record_visit(state.left_out, drawn.position, drawn.left_out)
+            self.ops.add_score(state.stats, forward.out, prior, tissue_mask, opacities, scale, skip)
+        if state.left_out is not None and forward.left_out is not None:
+            record_visit(state.left_out, forward.position, forward.left_out)
 
-    def _update(self, state: GaussiansState, drawn: Drawn) -> None:
+    def _update(self, state: GaussiansState, forward: ForwardPass) -> None:
         """Apply the gradients."""
-        state.optimizer.step(drawn.iteration, self.check.skip)
+        state.optimizer.step(forward.iteration, self.check.skip)
         if self.cfg.deformation.max_scale_change > 1:
             log_scales = state.gaussians["log_scales"].detach()
-            camera, init = drawn.frame.camera, self.cfg.init
-            limit_scales(log_scales, drawn.splats.means, camera, largest_share(camera, init.budget), init.thickness)
+            camera, init = forward.frame.camera, self.cfg.init
+            limit_scales(log_scales, forward.splats.means, camera, largest_share(camera, init.budget), init.thickness)
 
     def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
         planned = self.method.plan(state.stats, state.gaussians, self.extent, state.stage, iteration, self.cfg)

@@ -22,7 +22,7 @@ from .local_motion import NUM_NEIGHBORS
 
 if TYPE_CHECKING:
     from .ops import TrainingOps
-    from .state import Before, Drawn
+    from .state import Before, ForwardPass
 
 DISPLACEMENT_WEIGHT, DISTANCE_WEIGHT = 1.0, 0.2  # lambda_disp and lambda_dist
 MOTION_THRESHOLD, MOTION_TEMPERATURE = 0.45, 0.08  # tau_m and gamma_m of Eq. (9)
@@ -106,10 +106,10 @@ def least_points(cfg: TemporalConfig) -> int:
 
 
 def temporal_terms(
-    drawn: Drawn, before: Before, motion: Motion, stats: DensityStats, cfg: Config, ops: TrainingOps
+    forward: ForwardPass, before: Before, motion: Motion, stats: DensityStats, cfg: Config, ops: TrainingOps
 ) -> dict[str, Tensor]:
     """L_local of Eq. (11), weighted, () each; nothing with few Gaussians."""
-    temporal, out, means = cfg.temporal, drawn.out, drawn.splats.means
+    temporal, out, means = cfg.temporal, forward.out, forward.splats.means
     seen = out.radii > 0
     both = temporal.gradient == "both"
     if both:
@@ -122,7 +122,7 @@ def temporal_terms(
     )
     if not len(index):
         return {}
-    earlier = _means_before(drawn, before, motion, index, cfg, ops)
+    earlier = _means_before(forward, before, motion, index, cfg, ops)
     if both:
         kept = _on_tissue(earlier.detach(), before.frame, ops)
         index, weights, earlier = index[kept], weights[kept], earlier[kept]
@@ -135,11 +135,13 @@ def temporal_terms(
     }
 
 
-def _means_before(drawn: Drawn, before: Before, motion: Motion, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
+def _means_before(
+    forward: ForwardPass, before: Before, motion: Motion, index: Tensor, cfg: Config, ops: TrainingOps
+) -> Tensor:
     """(P, 3) centers of the chosen Gaussians at the frame before, with a gradient only if that end is trained."""
     if before.means is not None:
         return before.means[index]
-    means, known = drawn.gaussians["means"], (drawn.gaussians, drawn.field, before.frame.time, cfg, ops.model)
+    means, known = forward.gaussians["means"], (forward.gaussians, forward.field, before.frame.time, cfg, ops.model)
     if cfg.temporal.gradient == "both":
         # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
         return (means + motion.offsets(*known).means)[index]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..core.checks import number_ranges
 from ..data import FrameSequence
+from ..data.edit import replace_masks
 from ..data.found_tools import drop_rows
-from ..data.writer import replace_masks
 from ..footage.carry_masks import CarriedEdit, carry_mask_edit
 from ..tool_masks.clicked_tools import SearchStep, ToolClick, find_clicked, free_clicked
 from .incoming import BRUSH_NODE, JobQueue

@@ -48,7 +48,7 @@ def scene_file(scene: Scene, button: str, frame: int, progress: Progress) -> tup
         InputError: there is nothing to write, such as a mesh of a scene without a surface.
     """
     wanted = SCENE_FILES[button]
-    times = (frame / len(scene.cameras),) if wanted.of_one_frame else ()
+    times = (scene.frame_time(frame),) if wanted.of_one_frame else ()
     name = wanted.stem + (f"_{frame:06d}" if wanted.of_one_frame else "") + wanted.suffix
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / name

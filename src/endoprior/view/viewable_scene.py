@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .. import render
 from ..core.geometry import back_project, expected_depth, length_unit, project, quaternion_to_matrix
-from ..core.types import Camera, RenderOutput, Splats
+from ..core.types import Camera, RenderOutput, Splats, frame_times, to_uint8
 from ..data import FrameSequence
 from ..model.carry import carry, centers_then
 from ..model.colors import FEW_ITERATIONS, one_color
@@ -24,7 +24,7 @@ from ..model.playback import Playback
 from ..model.scene import Scene
 from ..model.surface import Support, Surface, project_visible, shown_pixels
 from ..model.uncertainty import point_errors
-from ..visualization.image_tools import SOLID_ALPHA, colorize, gray, to_u8
+from ..visualization.image_tools import SOLID_ALPHA, colorize, gray
 from ..visualization.measures import displacement_span, stretch_span, value_colors
 from ..visualization.rendered_views import depth_span
 from . import layers
@@ -111,7 +111,7 @@ class ViewableScene:
         if settings.smoke and settings.endoscope:
             view = behind_smoke(out.view, self.scene.smoke_at(settings.frame / len(self.cameras)))
             color = view.color.cpu().numpy()
-        return to_u8(color)
+        return to_uint8(color)
 
     def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
         """(H, W) z of the visible surface, mm; 0 where there is none."""
@@ -185,7 +185,7 @@ class ViewableScene:
         rows = _rows(splats, settings, camera)
         splats = _taken(splats, rows)
         if in_color:
-            colors = to_u8((splats.sh[:, 0] * SH_C0 + 0.5).cpu().numpy())
+            colors = to_uint8((splats.sh[:, 0] * SH_C0 + 0.5).cpu().numpy())
         else:
             colors = value_colors(self._values(settings)[rows].cpu().numpy(), (0, 1))
         points = splats.means.cpu().numpy()
@@ -205,7 +205,7 @@ class ViewableScene:
 
     def follow(self, points: NDArray, frames: list[int]) -> FollowedPoints:
         """Points (K, 3), each picked in its frame of `frames`, in every frame; NaN where unknown."""
-        times, own = [i / len(self.cameras) for i in range(len(self.cameras))], np.array(frames, np.intp)
+        times, own = frame_times(len(self.cameras)), np.array(frames, np.intp)
         carried = carry(self.scene, np.asarray(points), own, times)
         return FollowedPoints(carried.positions, point_errors(self.scene, carried, own, range(len(times))))
 

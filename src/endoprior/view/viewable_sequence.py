@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ..core.geometry import back_project, camera_to_world, length_unit, pixel_centers
 from ..core.types import Camera
 from ..data import FrameSequence
+from ..data.edit import write_scale
 from ..data.scale import scale_between
-from ..data.scale_files import write_scale
 from ..priors import joint_texture_prior
 from ..visualization.image_tools import colorize
 from . import layers

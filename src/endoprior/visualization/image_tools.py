@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.types import to_uint8
 from ..data.images import save_png
 from ..system.atomic import whole_file
 
@@ -40,19 +41,14 @@ def save_figure(figure: Figure, path: Path) -> None:
         figure.savefig(temporary, format="png", pil_kwargs={"compress_level": 1})
 
 
-def to_u8(unit: NDArray) -> NDArray[np.uint8]:
-    """Values in [0, 1], rounded to 0..255; values outside are clipped."""
-    return (np.clip(unit, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
 def gray(unit: NDArray) -> NDArray[np.uint8]:
     """(H, W, 3) gray image of (H, W) values in [0, 1]."""
-    return np.repeat(to_u8(unit)[..., None], 3, -1)
+    return np.repeat(to_uint8(unit)[..., None], 3, -1)
 
 
 def colorize(values: NDArray, low: float, high: float, valid: NDArray | None = None) -> NDArray[np.uint8]:
     """Turbo color map of (H, W) values: blue at `low`, red at `high`; black where `valid` is False."""
-    unit = to_u8((np.nan_to_num(values) - low) / max(high - low, 1e-9))
+    unit = to_uint8((np.nan_to_num(values) - low) / max(high - low, 1e-9))
     colors: NDArray = cv2.applyColorMap(unit, cv2.COLORMAP_TURBO)[..., ::-1]
     return colors if valid is None else colors * np.asarray(valid, np.uint8)[..., None]
 

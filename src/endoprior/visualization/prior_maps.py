@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.types import to_uint8
 from ..data import FrameSequence, Split
 from ..priors import joint_texture_prior, salience, specular_likelihood
 from ..system.atomic import reject_occupied, whole_folder
-from .image_tools import colorize, gray, label, scaled, tile, to_u8, write_png
+from .image_tools import colorize, gray, label, scaled, tile, write_png
 
 SHEET_FRAMES, SHEET_WIDTH_PX = 6, 320
 
@@ -34,7 +35,7 @@ def write_prior_maps(sequence: FrameSequence, split: Split, out: Path) -> Path:
                 "prior": joint_texture_prior(frame.rgb, frame.tissue_mask),
             }
             for name, values in maps.items():
-                write_png(folder / name / f"{frame.index:06d}.png", to_u8(values))
+                write_png(folder / name / f"{frame.index:06d}.png", to_uint8(values))
             if position in shown:
                 images = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": gray(frame.tissue_mask)}
                 images |= {name: colorize(values, 0, 1) for name, values in maps.items()}

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.types import Camera, Frame
+from ..core.types import Camera, Frame, to_uint8
 from ..data.reading import read_text
 from ..model.photometric import behind_smoke
 from ..model.scene import RenderedScene
 from ..system.atomic import whole_file
-from .image_tools import colorize, label, tile, to_u8, write_png
+from .image_tools import colorize, label, tile, write_png
 from .video import write_video
 
 TimedCamera = tuple[float, Camera]
@@ -128,7 +128,7 @@ def write_views(
             times, cameras = zip(*views[start : start + at_a_time], strict=True)
             for k, rendered in enumerate(scene.render_many(list(times), list(cameras)), start):
                 rendered = behind_smoke(rendered, scene.smoke_at(views[k][0])) if smoke else rendered
-                color, depth = to_u8(rendered.color.cpu().numpy()), rendered.depth.cpu().numpy()
+                color, depth = to_uint8(rendered.color.cpu().numpy()), rendered.depth.cpu().numpy()
                 write_png(out / "rgb" / f"{file_stem(k, frames)}.png", color)
                 with whole_file(out / "depth" / f"{file_stem(k, frames)}.npy") as temporary:
                     np.save(temporary, depth)

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from .. import render
 from ..core.geometry import pixel_centers, project
-from ..core.types import Camera, Frame, Splats
+from ..core.types import Camera, Frame, Splats, to_uint8
 from ..model.carry import centers_then
 from ..model.colors import with_fixed_color
 from ..model.gaussians import with_colors
 from ..model.scene import Scene
 from ..model.surface import FramesOf, Support, project_visible, render_surface
 from ..system.atomic import whole_file
-from .image_tools import SOLID_ALPHA, label, to_u8
+from .image_tools import SOLID_ALPHA, label
 from .rendered_views import TimedCamera, file_stem, write_side_by_side
 
 SQUARES, STRIPES = 40, 80
@@ -149,7 +149,7 @@ def write_texture_video(
 ) -> None:
     """Write a grid, painted on the first frame, as it is carried to each view; see `write_side_by_side`."""
     painted = PaintedTissue(scene)
-    pictures = ([label(to_u8(painted.render(*view)), "carried grid")] for view in views)
+    pictures = ([label(to_uint8(painted.render(*view)), "carried grid")] for view in views)
     write_side_by_side(pictures, out, video, scene.frames_per_second, frames)
 
 
@@ -171,6 +171,6 @@ def write_support_video(
             shown = support.render(*view)
             with whole_file(out / f"{file_stem(k, frames)}.npy") as temporary:
                 np.save(temporary, np.stack([shown.num_frames, shown.gap_seconds], -1))
-            yield [label(to_u8(shown.color), shown.legend)]
+            yield [label(to_uint8(shown.color), shown.legend)]
 
     write_side_by_side(pictures(), out, video, frames_per_second, frames)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...core.geometry import Strain, camera_to_world, cells_at, project
 from ...data import FrameSequence
-from ...footage.components import distance_inside
+from ...footage.image_operations import distance_inside
 from ...model.carry import carry_points
 from ...model.measures import SurfaceMotion, strain_around, surface_samples
 from ...model.scene import Scene

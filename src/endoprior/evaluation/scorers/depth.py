@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
-from ...footage.components import Mask
+from ...footage.image_operations import Mask
 from ..score import Score
 from .image import check_finite_float, checked_mask
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.types import to_uint8
 from ...model.colors import changes_color
 from ...model.highlights import without_highlights
-from ..context import EvaluationContext, to_uint8
+from ..context import EvaluationContext
 from ..score import Score
 from .image import psnr_tissue
 

@@ -2,7 +2,7 @@
 
 Shared letters: `H, W` image size. `image` and `target` are (H, W, 3) rendered and true color in [0, 1];
 `scored_mask` is (H, W) True = the pixel counts: the tissue, or a part of the image. A frame without any scores NaN.
-Sums are in float64. The protocol measures 8-bit images: round rendered color with `context.to_uint8` first. ValueError
+Sums are in float64. The protocol measures 8-bit images: round rendered color with `to_uint8` first. ValueError
 is raised where shapes differ, the mask is not bool, or an image is not finite floating point. Sources: the evaluation
 of EndoGaussian and EndoPrior-GS (docs/paper_map.md), Wang et al. 2004 for SSIM.
 """
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...core.checks import check_shape
 from ...core.ranges import evenly_spaced
-from ...footage.components import Mask
+from ...footage.image_operations import Mask
 from ..score import Score, ScoreUnavailable
 
 if TYPE_CHECKING:

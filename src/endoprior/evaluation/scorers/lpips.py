@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.shell import missing_package
-from ...footage.components import Mask
+from ...footage.image_operations import Mask
 from ..context import NETWORKS_OFF, EvaluationContext
 from ..networks import (
     ALEXNET,

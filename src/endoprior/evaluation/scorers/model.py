@@ -98,7 +98,7 @@ def frames_per_second(scene: RenderedScene, *, cached: bool = False) -> float:
         if playback:
             playback.render(i % num_frames)
         else:
-            scene.render(i % num_frames / len(scene.cameras))
+            scene.render(scene.frame_time(i % num_frames))
 
     _rate(render, num_frames if cached else FPS_WARM_UP, scene)
     return _rate(render, FPS_RENDERS, scene)

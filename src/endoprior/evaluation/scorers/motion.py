@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...core.checks import check_shape
 from ...core.types import Frame
-from ...footage.components import Image, Mask
+from ...footage.image_operations import Image, Mask
 from ...footage.optical_flow import MIN_SIZE_PX, dense_flow, gray_for_flow
 from ...model.colors import changes_color, with_fixed_color
 from ...system.parallel import frame_threads

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...core.geometry import expected_depth, right_camera
 from ...core.types import Frame
-from ...footage.components import Mask
+from ...footage.image_operations import Mask
 from ...footage.stereo_order import measured_disparity, warp_to_right
 from ..context import EvaluationContext
 from ..score import Score

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.geometry import camera_to_world, unit_vectors
+from ...core.types import frame_times
 from ...model.carry import carry
 from ...model.surface import surface_points
 from ...model.uncertainty import PointErrors, point_errors
@@ -56,7 +57,7 @@ def compute(context: EvaluationContext) -> None:
     first = true.first
     starts = surface_points(scene, true.at_start(true.pixels), first)
     known = np.flatnonzero(np.isfinite(starts).all(1))
-    times = [i / len(sequence) for i in range(len(sequence))]
+    times = frame_times(len(sequence))
     carried = carry(scene, starts[known], first[known], times)
     errors = point_errors(scene, carried, first[known], range(len(sequence)))
     pose = camera_to_world(sequence.camera(i) for i in range(len(sequence)))

@@ -17,8 +17,9 @@ from ...core.ranges import evenly_spaced
 from ...core.types import Camera, Frame
 from ...data import FrameList, FrameSequence
 from ...footage.alignment import align
-from ...footage.components import Mask
-from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, follow_both_ways, gray_for_flow
+from ...footage.image_operations import Mask
+from ...footage.keypoints import track_points
+from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, fixed_in_image, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from ...model.surface import depth_at, project_visible, render_surface, shown_pixels
@@ -204,7 +205,7 @@ def follow(sequence: FrameSequence, first: int, ahead: int) -> Followed:
     for index in range(first + 1, first + ahead + 1):
         before, frame = frame, sequence.frame(index)
         following = gray_for_flow(frame.rgb_u8, 1)
-        there, returned = follow_both_ways(gray, following, now)
+        there, returned = track_points(gray, following, now)
         step = align(gray, following, before.tissue_mask, frame.tissue_mask)
         if step is not None:
             returned &= ~fixed_in_image(there - now, now @ step[:2, :2].T + step[:2, 2] - now, width)

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...core.geometry import back_project, bilinear, camera_to_world, cells_at, project
-from ...core.types import Camera, Frame
+from ...core.types import Camera, Frame, frame_times
 from ...data import FrameSequence, nearest_end_errors
-from ...footage.components import Image, distance_inside
+from ...footage.image_operations import Image, distance_inside
 from ...footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow
 from ...model.carry import carry_points
 from ...model.scene import Scene
@@ -335,7 +335,7 @@ def true_tracks(sequence: FrameSequence) -> TrueTracks | None:
 
 def by_scene(scene: Scene, true: TrueTracks, sequence: FrameSequence) -> PredictedTracks:
     """Points carried by the Gaussians; visible where neither rendered tissue nor the tool mask hides them."""
-    times = [i / len(sequence) for i in range(len(sequence))]
+    times = frame_times(len(sequence))
     world = carry_points(scene, _world_starts(true, sequence), true.first, times)
     tracks = _in_frames(world, sequence)
     for i, frame in enumerate(sequence.frames("video")):

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...footage.alignment import align
-from ...footage.keypoints import keypoints
-from ...footage.optical_flow import fixed_in_image, follow_both_ways
+from ...footage.keypoints import keypoints, track_points
+from ...footage.optical_flow import fixed_in_image
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
 from .tracks import PoseInput, TrackingCamera
@@ -120,8 +120,8 @@ def followed(before: TrackingFrame, now: TrackingFrame, pixels: NDArray) -> tupl
     """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
-    near, good = follow_both_ways(before.plain, now.plain, pixels, halvings=COARSE_HALVINGS)
-    there, still_good = follow_both_ways(
+    near, good = track_points(before.plain, now.plain, pixels, halvings=COARSE_HALVINGS)
+    there, still_good = track_points(
         before.flat, now.flat, pixels, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
     )
     good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(now.usable, there) > 0)
@@ -137,7 +137,7 @@ def followed_directly(before: TrackingFrame, now: TrackingFrame, pixels: NDArray
     guess = (pixels @ step[:2, :2].T + step[:2, 2]).astype(np.float32)
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
-    there, good = follow_both_ways(
+    there, good = track_points(
         before.flat,
         now.flat,
         pixels,

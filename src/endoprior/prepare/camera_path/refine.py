@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...footage.optical_flow import follow_and_return
+from ...footage.keypoints import track_forward_backward
 from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
 from .adjust import Adjusted, Observations, adjust, back_projected, residuals
 from .path import CameraPath
 from .tracks import PoseInput, TrackingCamera
-from .views import EvenView, Warp, choose_partners, matrix_at, scaled_size
+from .views import HighPassImage, Warp, choose_partners, matrix_at, scaled_size
 
 MAX_WIDTH = 640  # frames are matched at this width at most, px
 PIXEL_STD = 0.3  # of a match, px of an image 640 px wide
@@ -223,7 +223,7 @@ def match_frames(
 
 
 def _picture(seen: PoseInput, size: tuple[int, int]) -> _Picture:
-    view = EvenView.of(seen.rgb_u8, seen.tissue_mask, size)
+    view = HighPassImage.of(seen.rgb_u8, seen.tissue_mask, size)
     std = float(view.detail[view.usable > 0].std()) if view.usable.any() else 1.0
     levels = np.clip(128 + 128 / (CONTRAST * max(std, 1e-6)) * view.detail, 0, 255).astype(np.uint8)
     depth = cv2.resize(seen.depth, size, interpolation=cv2.INTER_NEAREST)
@@ -252,7 +252,9 @@ def _found(
     """(N, 2) px of the corners (N, 2) in another frame, NaN where they are not found."""
     x, y, _ = (each.astype(np.float32) for each in warp.at(inverse))
     warped = np.asarray(cv2.remap(other.detail_u8, x, y, cv2.INTER_LINEAR, borderValue=128), np.uint8)
-    now, back, good = follow_and_return(detail_u8, warped, pixels, side_px=WINDOW_PX, halvings=LEVELS, criteria=STOP)
+    now, back, good = track_forward_backward(
+        detail_u8, warped, pixels, side_px=WINDOW_PX, halvings=LEVELS, criteria=STOP
+    )
     good &= (np.hypot(*(back - pixels).T) < MAX_BACK_PX) & (np.hypot(*(now - pixels).T) < MAX_SHIFT_PX)
     place = np.stack([cv2.remap(each, now[:, :1], now[:, 1:], cv2.INTER_LINEAR).ravel() for each in (x, y)], 1)
     inner = cv2.remap(other.inner, place[:, :1], place[:, 1:], cv2.INTER_NEAREST, borderValue=0).ravel() > 0

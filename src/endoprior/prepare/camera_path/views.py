@@ -33,7 +33,7 @@ HIGHLIGHT = 0.5  # likelihood from which a pixel is a highlight
 
 
 @dataclass(frozen=True)
-class EvenView:
+class HighPassImage:
     """A small frame (h, w)."""
 
     detail: NDArray[np.float32]
@@ -42,7 +42,7 @@ class EvenView:
     """(h, w) 1 on tissue without highlights, else 0."""
 
     @classmethod
-    def of(cls, rgb_u8: NDArray[np.uint8], tissue_mask: NDArray[np.bool_], size: tuple[int, int]) -> EvenView:
+    def of(cls, rgb_u8: NDArray[np.uint8], tissue_mask: NDArray[np.bool_], size: tuple[int, int]) -> HighPassImage:
         """The view of a frame (H, W, 3) with its tissue (H, W), at `size` (w, h)."""
         counts = tissue_mask & (specular_likelihood(rgb_u8 * np.float32(1 / 255)) < HIGHLIGHT)
         share = cv2.resize(counts.astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -54,11 +54,11 @@ class EvenView:
         detail = usable * (log - cv2.GaussianBlur(log * usable, (0, 0), sigma) / weight)
         return cls(np.asarray(detail, np.float32), usable)
 
-    def resized(self, size: tuple[int, int]) -> EvenView:
+    def resized(self, size: tuple[int, int]) -> HighPassImage:
         """The view at a smaller size (w, h)."""
         usable = cv2.resize(self.usable, size, interpolation=cv2.INTER_AREA)
         detail = cv2.resize(self.detail, size, interpolation=cv2.INTER_AREA)
-        return EvenView(np.asarray(detail, np.float32), (usable > USABLE).astype(np.float32))
+        return HighPassImage(np.asarray(detail, np.float32), (usable > USABLE).astype(np.float32))
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.ranges import evenly_spaced
-from .background_motion import difference_from_background
-from .components import AREA, Image, InOrder, Mask, components, disk, distance_inside
-from .optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
+from ..footage.image_operations import AREA, Image, InOrder, Mask, components, disk, distance_inside
+from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, difference_from_background, flow_pair, gray_for_flow
 
 SIDE_PX = 160  # shorter side of the images that are compared
 COMPARED, MIN_PAIRS = 24, 8  # pairs of frames; with fewer in which the tissue moves, nothing is said

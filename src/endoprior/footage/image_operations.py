@@ -1,4 +1,4 @@
-"""Masks of True and False: connected regions, growth and distances, computed by OpenCV."""
+"""Types of images and masks, and operations on them by OpenCV: channels, connected regions, dilation, distances."""
 
 from __future__ import annotations
 
@@ -20,6 +20,18 @@ class InOrder(Protocol):
     """As `map`: what a function gives for each item, in order. Threads may call it for several items at a time."""
 
     def __call__(self, function: Callable[[Item], Result], items: Iterable[Item], /) -> Iterator[Result]: ...
+
+
+def largest_channel(image: Image) -> Image:
+    """(H, W) of an image (H, W, 3)."""
+    red, green, blue = cv2.split(image)
+    return np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
+
+
+def smallest_channel(image: Image) -> Image:
+    """(H, W) of an image (H, W, 3)."""
+    red, green, blue = cv2.split(image)
+    return np.asarray(cv2.min(cv2.min(red, green), blue), np.uint8)
 
 
 def components(mask: Mask, connectivity: int = 8) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
