@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from endoprior.data import FrameSequence
 
 KEY_DIGITS = 16
-SCORES_VERSION = 1
+SCORES_VERSION = 2
 """Increase it when a score changes its meaning; finished cells then run again."""
 
 
