@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path, PureWindowsPath
 from string import ascii_lowercase, ascii_uppercase
 
 from ..core.checks import input_error, similar_name
 from ..core.shell import quoted
-from ..core.types import Fingerprints
 from .reading import ACCESS_HINT, reading
 
 DECIMAL = re.compile(r"[0-9]+(?:\.[0-9]+)?")
@@ -234,17 +233,18 @@ def demand_same(files: Sequence[Path], states: Sequence[FileState], before: Sequ
             raise input_error(file, "data that stays as it is during training", "a file that was changed", fix)
 
 
-def fingerprints_of(files: Sequence[Path], images: Sequence[Path], folder: Path) -> Fingerprints:
-    """The fingerprints of a sequence in a folder: `files` are all of it, `images` some of them."""
+def digests_of(files: Iterable[Path]) -> dict[Path, bytes]:
+    """SHA-256 of the contents of each file."""
     digests = dict[Path, bytes]()
-    for file in sorted(set(files)):
+    for file in files:
         with reading(file), file.open("rb") as content:
             digests[file] = hashlib.file_digest(content, "sha256").digest()
+    return digests
 
-    def joined(some: Sequence[Path]) -> str:
-        whole = hashlib.sha256()
-        for file in sorted(some):
-            whole.update(os.fsencode(file.relative_to(folder).as_posix()) + b"\0" + digests[file])
-        return whole.hexdigest()
 
-    return Fingerprints(joined(files), joined(images) if images else "")
+def fingerprint_of(digests: Mapping[Path, bytes], folder: Path) -> str:
+    """SHA-256, in hex, of the names (below the folder) and the digests of files."""
+    whole = hashlib.sha256()
+    for file in sorted(digests):
+        whole.update(os.fsencode(file.relative_to(folder).as_posix()) + b"\0" + digests[file])
+    return whole.hexdigest()

@@ -21,7 +21,7 @@ from ..core.types import Camera, Fingerprints, Frame
 from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
 from .description import ESTIMATED_POSES, TOOLS_FOUND
-from .files import demand_same, fingerprints_of, state_of
+from .files import demand_same, digests_of, fingerprint_of, state_of
 from .pixels import weighted
 from .scale import Scale
 from .trainable import demand_trainable, frame_contents
@@ -321,7 +321,9 @@ class FrameSequence:
 
     def fingerprints(self) -> Fingerprints:
         """That of all files, and that of the images of its frames."""
-        return fingerprints_of(self.files, self.image_files, self.path)
+        digests = digests_of({*self.files})
+        images = {file: digests[file] for file in self.image_files}
+        return Fingerprints(fingerprint_of(digests, self.path), fingerprint_of(images, self.path) if images else "")
 
     def demand_unchanged(self, fingerprint: str | None = None) -> None:
         """Raise InputError if a file changed since the sequence was opened, so that frames of two states may be mixed.

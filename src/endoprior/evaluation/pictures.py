@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.types import Camera
 from ..data import FrameSequence, Split, read_depth_file
-from ..data.files import entries, files_with, fingerprint_of
+from ..data.files import digests_of, entries, files_with, fingerprint_of
 from ..data.frame_files import HINT, match_names
 from ..data.images import decode_image, describe_pixels, single_channel
 from ..data.reading import kind_of
@@ -81,7 +81,7 @@ class Pictures:
 def fingerprint(folder: Path, suffixes: tuple[str, ...] = (".png", ".npy")) -> str:
     """SHA-256, in hex, of the names and contents of the files of a folder with one of the suffixes."""
     files = [file for file in entries(folder) if file.is_file() and file.suffix.lower() in suffixes]
-    return fingerprint_of(files, folder)
+    return fingerprint_of(digests_of(files), folder)
 
 
 def frames_of_files(
