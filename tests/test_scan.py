@@ -15,6 +15,7 @@ from endoprior.footage.scenes import breaks, half_stays, jumps, places_differ, s
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline.choice import choose_segment
 from endoprior.prepare.scan import scan_video
+from endoprior.prepare.scan_figure import CURVES, draw_scan
 from endoprior.prepare.segments import as_json, best_start, from_json, stretches_of
 
 RATE = 10.0
@@ -182,3 +183,13 @@ def test_the_best_seconds_are_those_of_a_slow_loop():
         means = [float(np.mean(weights[i : i + length])) for i in range(40 - length + 1)]
         found = best_start(scanned, (0.0, 8.0), seconds)
         assert means[round(found * 5)] >= max(means) - 0.01  # the first of nearly equal ones
+
+
+@pytest.mark.parametrize("count", [5, 15, 24])
+def test_the_images_of_the_timeline_are_spread_over_the_whole_video(count, tmp_path, monkeypatch):
+    images, shown = [np.full((8, 10, 3), i, np.uint8) for i in range(count)], []
+    monkeypatch.setattr("matplotlib.axes.Axes.imshow", lambda _axes, image: shown.append(int(image.max())))
+    looks = {name: [0.5, 0.5] for name in ("seconds", "shift", *CURVES)}
+    scanned = {"seconds": 1.0, "looks": looks, "cuts": [], "segments": [], "not_usable": []}
+    draw_scan(tmp_path / "video.mp4", scanned, tmp_path / "scan.png", pictures=images)
+    assert shown[0] == 0 and shown[-1] == count - 1 and len(shown) == min(count, 8)

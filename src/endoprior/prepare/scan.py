@@ -32,7 +32,6 @@ from .source import open_source, quick_images
 
 LOOKS, RATES = 2400, (2.0, 10.0)
 """So many images are looked at, if that is not less or more than these rates, 1/s."""
-PICTURES = 8  # of these, for the timeline
 NUM_SAMPLE_IMAGES = 24  # images that show which part of the frame is the endoscope's image
 BACK_S = 3.0  # tissue is looked for in the images of so long before, s
 BACK = (1, 2, 5, 12, 28)  # how many images before; each costs a comparison of features
@@ -61,7 +60,7 @@ class Scan:
     rate: float  # looks a second, at most
     looks: list[Look]
     cuts: list[float]  # times of the first images after cuts, s
-    pictures: list[Image]  # a few small images (h, w, 3), spread over it
+    pictures: list[Image]  # a few small images (h, w, 3), evenly spaced
 
 
 def scan_video(
@@ -117,7 +116,7 @@ def scan_video(
         rate,
         _judged(looks, is_cut, connected(len(looks), watch.pairs), np.array(frozen) < FROZEN, rate),
         cuts,
-        pictures[:: max(len(pictures) // PICTURES, 1)][:PICTURES],
+        pictures,
     )
 
 
