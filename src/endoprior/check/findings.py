@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..core.checks import quotation
+from ..core.checks import frame_list, quotation
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
 from ..core.shell import command
@@ -27,7 +27,7 @@ from ..footage.stereo_order import StereoOrder
 from ..model.presets import preset
 from ..system.parallel import frame_threads
 from .facts import BYTES_PER_PX, Facts
-from .finding import About, Finding, about_sequence, convert_poses, frame_list, longest_part, set_values, skip
+from .finding import About, Finding, about_sequence, convert_poses, longest_part, set_values, skip
 from .samples import (
     are_inverted,
     as_read,

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.checks import check_range, number_ranges
+from ..core.checks import check_range, frame_list
 from ..core.geometry import Convention
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
@@ -93,13 +93,14 @@ class Poses(Command):
     and explains the frames better), `own`, `colmap`, `auto-own`, `still`, or a file as for `prepare --poses`."""
     poses_convention: Convention = "opencv"
     """Meaning of the matrices in the file of --poses, as for `prepare`."""
-    poses_unit_mm: float = 1.0
-    """mm per unit of the positions in the file of --poses: 1000 for m."""
+    poses_unit_mm: float | None = None
+    """mm per unit of the positions in the file of --poses, as for `prepare`."""
 
     examples = ("DATA", "DATA --poses estimate")
 
     def __post_init__(self) -> None:
-        check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
+        if self.poses_unit_mm is not None:
+            check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
 
     def execute(self) -> None:
         """Find the camera path and write it."""
@@ -113,7 +114,7 @@ class Poses(Command):
         for note in found.notes:
             say(note_line(note))
         if found.unexplained:
-            say(f"note: no camera pose, or another scene, in frames {number_ranges(found.unexplained)}")
+            say(f"note: no camera pose, or another scene, in {frame_list(found.unexplained)}")
         if found.kept is not None:
             say(f"note: the poses that were there are kept in {found.kept}")
         if (self.data / TRUTH).exists():

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error, number_ranges
+from ..core.checks import frame_list, input_error
 from ..core.shell import changed_options, command, quoted
 from ..data import write_stir_tracks
 from ..data.description import PATH_RECORD, SIZE_NOT_STATED, PrepareRecord
@@ -330,7 +330,7 @@ def _usage_notes(damaged: list[int], outside: int) -> list[str]:
     if damaged:
         what = "damaged in the video, or predicted from damaged images before the next key frame"
         fix = "leave them out with --start and --end, or copy the video again"
-        where = f"frames {number_ranges(damaged)}. They are unexplained_frames of sequence.json"
+        where = f"{frame_list(damaged)}. They are unexplained_frames of sequence.json"
         notes.append(ToDo(f"{what}: {where}; {fix}"))
     if outside:
         notes.append(f"{outside} frames without the color of the inside of a body are left out")
@@ -341,13 +341,13 @@ def _advice(out: Path, uncertain: list[int], moving: list[int], others: list[int
     """Notes on frames to look at: of unsure masks, of likely missed tools, without a pose."""
     notes, correct = [], f"To look and correct: {command('view', out)}"
     if uncertain:
-        notes.append(f"masks: unsure in frames {number_ranges(uncertain)}. {correct}")
+        notes.append(f"masks: unsure in {frame_list(uncertain)}. {correct}")
     if moving:
-        what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
+        what = f"in {frame_list(moving)}, something moves that no mask covers"
         notes.append(f"masks: tools are likely missed: {what}. {correct}")
     if others:
         fix = "look at the images: is this one video?" if usable < 2 else "--start and --end can leave them out"
-        notes.append(f"no camera pose, or another scene, in frames {number_ranges(others)}; {fix}")
+        notes.append(f"no camera pose, or another scene, in {frame_list(others)}; {fix}")
     return notes
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ...core.checks import input_error, number_ranges
+from ...core.checks import frame_list, input_error
 from ...core.geometry import Convention, length_unit, to_ours
 from ...core.ranges import evenly_spaced
 from ...core.shell import install_command
@@ -60,7 +60,7 @@ class Reading:
     """How the matrices of a file of poses are to be read."""
 
     convention: Convention = "opencv"
-    unit_mm: float = 1.0  # mm per unit of the positions
+    unit_mm: float | None = None  # mm per unit of the positions; None: as usual for files of the kind
     turn: NDArray | None = None  # (3, 3) rotation from the camera of the poses to that of the frames; None: the same
     sources: Sequence[int] | None = None  # place of each frame in the video, where a file has a row for each image
     image_times: Sequence[float] = ()  # of all images of the video, or else of the frames, s
@@ -77,7 +77,7 @@ class Reading:
 
     def ours(self, stored: NDArray) -> NDArray:
         """(T, 4, 4) camera-to-world of the frames, mm, OpenCV axes."""
-        poses = to_ours(stored, self.convention, self.unit_mm)
+        poses = to_ours(stored, self.convention, self.unit_mm or 1.0)
         if self.turn is not None:
             poses[:, :3, :3] = poses[:, :3, :3] @ self.turn.T
         return poses
@@ -155,8 +155,8 @@ def _unknown_path(motion: CameraMotion, why: str) -> tuple[CameraPath, list[str]
         rests = np.zeros(count, bool)
     poses = np.tile(np.eye(4), (count, 1, 1))
     path = CameraPath(poses, rests, np.ones(count), UNKNOWN_POSES, is_unknown=True)
-    frames = number_ranges(np.flatnonzero(rests).tolist())
-    end = f"in frames {frames} the view rests, and one camera serves them" if rests.any() else "no model is possible"
+    frames = frame_list(np.flatnonzero(rests).tolist())
+    end = f"in {frames} the view rests, and one camera serves them" if rests.any() else "no model is possible"
     moved = "how the camera moves is unknown" if motion.moving else "the motion of the camera is unknown"
     return path, [
         f"{moved}: {motion.reason}; {why}. No poses are claimed: {end}. More frames per second, or another part of "
@@ -182,10 +182,10 @@ def _given_path(
         stored, known, rule = read_model_poses(Path(how), sources, reading.image_names)
         notes.append(f"{how}: poses {rule}; their unit is that of --poses-unit-mm")
     elif is_text(Path(how)):
-        if reading.unit_mm == AS_OURS.unit_mm:
-            reading = replace(reading, unit_mm=MM_PER_M)  # what such files have
-        stored, rule = read_text_poses(Path(how), count, reading.sources, reading.image_times, reading.unit_mm)
-        notes.append(f"{how}: rows are matched {rule}; its unit is taken as {reading.unit_mm:g} mm")
+        unit_mm = reading.unit_mm or MM_PER_M
+        reading = replace(reading, unit_mm=unit_mm)
+        stored, rule = read_text_poses(Path(how), count, reading.sources, reading.image_times, unit_mm)
+        notes.append(f"{how}: rows are matched {rule}; its unit is taken as {unit_mm:g} mm")
     else:
         stored = read_poses(Path(how), count)
     path = CameraPath(reading.ours(stored), known, np.ones(count))
@@ -365,10 +365,12 @@ def _fit_notes(how: str, stored: NDArray, frame: Frame, lens: TrackingCamera, re
         return seen.rgb_u8, seen.tissue_mask, np.nan_to_num(seen.depth)
 
     scaled, turn = stored.copy(), np.eye(3) if reading.turn is None else reading.turn
-    scaled[:, :3, 3] *= reading.unit_mm
+    unit_mm = reading.unit_mm or 1.0
+    scaled[:, :3, 3] *= unit_mm
     fit = measure_poses(view, lens.matrix, scaled, reading.convention, turn=turn, relative=lens.depth_is_relative)
     if fit is not None and fit.another_fits:
-        unit = f" --poses-unit-mm {fit.unit * reading.unit_mm:.4g}" if fit.unit * reading.unit_mm != 1 else ""
+        right = f"{fit.unit * unit_mm:.4g}"
+        unit = f" --poses-unit-mm {right}" if right != "1" or is_text(Path(how)) else ""
         words = f"the poses in {how} explain the images better in another way: {fit.reason}"
         return [f"{words}. If so: --poses-convention {fit.best}{unit}"]
     if fit is not None and fit.none_fits:
@@ -391,7 +393,7 @@ def _estimate_notes(reason: str, path: CameraPath, lens: TrackingCamera) -> list
         stds = f"{moved:.2f} {unit}, {turned:.3f} degrees"
         notes.append(f"camera pose, standard deviation (median of the frames): {stds}")
     if path.still is not None and path.still.any():
-        notes.append(f"the camera rests in frames {number_ranges(np.flatnonzero(path.still).tolist())}")
+        notes.append(f"the camera rests in {frame_list(np.flatnonzero(path.still).tolist())}")
     if path.focal_factor != 1:
         old = lens.matrix[0, 0]
         notes.append(f"focal length refined with the path: {old * path.focal_factor:.0f} px in place of {old:.0f} px")
