@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import write_tiny_sequence
-from relief import HEIGHT, MATRIX, WIDTH, path, pose, view
+from relief import HEIGHT, MATRIX, WIDTH, camera, path, pose, reader, view
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
@@ -270,7 +270,7 @@ def errors(found, frames, index, guess=80.0):
 
 def measured(tmp_path, frames, poses):
     flat = [replace(frame, depth=np.full((HEIGHT, WIDTH), 80, np.float32)) for frame in frames]
-    return measure_depth(flat.__getitem__, poses, np.ones(len(frames), bool), CENTERED, SIZE, tmp_path)
+    return measure_depth(reader(flat), camera(), poses, np.ones(len(frames), bool), tmp_path)
 
 
 def test_a_relief_is_measured_from_a_known_path(tmp_path):

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..core.types import SURE_DEPTH
 from ..system.memory import BoundedCache, cache_bytes
 from ..system.parallel import frame_threads
-from .camera_path.tracks import PoseInput
+from .camera_path.tracks import FrameReader, PoseInput, TrackingCamera
 from .camera_path.views import EvenView, Warp, choose_partners, scaled_size
 from .plane_sweep import FINE_WIDTH, Shot, Sweep
 
@@ -73,24 +73,22 @@ class ParallaxDepth:
 
 
 def measure_depth(
-    frame: Callable[[int], PoseInput],
+    frames: FrameReader,
+    camera: TrackingCamera,
     world_to_camera: NDArray[np.float64],
     usable: NDArray[np.bool_],
-    matrix: NDArray[np.float64],
-    size: tuple[int, int],
     folder: Path,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> ParallaxDepth:
     """Measure the depth of all frames.
 
     Args:
-        frame: reads frame i, with a guess of its depth in the unit of the path.
+        frames: with depth that is bent to what is measured, in the unit of the path.
         world_to_camera: (T, 4, 4). usable: (T,) whether a frame has a pose of its own.
-        matrix: (3, 3) K, px; the left-most pixel is centered at 0. size: (width, height), px.
         folder: for files of all frames, 19 bytes for each pixel of a small frame; made if it is not there.
         progress: is told the number of frames measured.
     """
-    count, small = len(world_to_camera), scaled_size(size, FINE_WIDTH)
+    count, size, small = frames.count, camera.size, scaled_size(camera.size, FINE_WIDTH)
     everything, shape = range(count), small[::-1]
     folder.mkdir(exist_ok=True)
 
@@ -102,12 +100,12 @@ def measure_depth(
     sureness, filled, factor = stored("confidence", np.uint8), stored("depth", np.float32), stored("factor", np.float32)
     guesses, distance, tissue_px, shares = stored("guess", np.float32), *np.zeros((3, count))
     with frame_threads(BYTES_PER_PX * shape[0] * shape[1]) as pool:
-        for i, found in zip(everything, pool.map(lambda i: _guessed(frame(i), small), everything), strict=True):
+        for i, found in zip(everything, pool.map(lambda i: _guessed(frames.frame(i), small), everything), strict=True):
             guesses[i], distance[i], tissue_px[i] = found
         usable = usable & np.isfinite(distance)
-        partners = choose_partners(world_to_camera, matrix, size, np.where(usable, distance, 1.0), usable)
-        sweep = Sweep.of(matrix, size, float(np.median(distance[usable])) if usable.any() else 1.0)
-        clip = _Clip(frame, guesses, world_to_camera, usable, partners, sweep)
+        partners = choose_partners(world_to_camera, camera.matrix, size, np.where(usable, distance, 1.0), usable)
+        sweep = Sweep.of(camera.matrix, size, float(np.median(distance[usable])) if usable.any() else 1.0)
+        clip = _Clip(frames, guesses, world_to_camera, usable, partners, sweep)
         for i, found in zip(everything, pool.map(clip.measured, everything), strict=True):
             if found is not None:
                 measured[i], scores[i] = found
@@ -125,17 +123,16 @@ class _Clip:
     """The frames of a clip, one at a time."""
 
     def __init__(
-        self, frame: Callable[[int], PoseInput], guesses: NDArray, poses: NDArray, usable: NDArray,
+        self, frames: FrameReader, guesses: NDArray, poses: NDArray, usable: NDArray,
         partners: list[tuple[int, ...]], sweep: Sweep,
     ) -> None:  # fmt: skip
-        self._frame, self._guesses, self._poses, self._usable = frame, guesses, poses, usable
+        self._frames, self._guesses, self._poses, self._usable = frames, guesses, poses, usable
         self._partners, self._sweep = partners, sweep
         self._views: BoundedCache[EvenView] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
 
     def view(self, i: int) -> EvenView:
         def seen() -> EvenView:
-            frame = self._frame(i)
-            return EvenView.of(frame.rgb_u8, frame.tissue_mask, self._sweep.size)
+            return EvenView.of(self._frames.color(i), self._frames.tissue(i), self._sweep.size)
 
         return self._views.get(i, seen)
 

@@ -194,14 +194,14 @@ def keyframe(index: int, view: TrackingFrame) -> Keyframe:
 
 
 def match_keyframe(
-    lens: TrackingCamera, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe
+    camera: TrackingCamera, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe
 ) -> KeyframeMatch | None:
     """Find the pose of `new` from what it shares with `old`; None if that is too little."""
     first, second = _matches(old.descriptors.astype(np.float32), new.descriptors.astype(np.float32))
     if len(first) < MIN_POSE_INLIERS:
         return None
-    points = back_projected(lens.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
-    found = coarse_pose(lens.matrix, points, new.pixels[second], None, INLIER_PX * lens.px)
+    points = back_projected(camera.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
+    found = coarse_pose(camera.matrix, points, new.pixels[second], None, INLIER_PX * camera.px)
     if found is None or found[1].sum() < max(MIN_POSE_INLIERS, 0.25 * len(first)):
         return None
     pose, inlier = found
