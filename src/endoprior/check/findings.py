@@ -23,7 +23,7 @@ from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.disturbances import DARK_MEAN_GRAY
 from ..footage.mask_polarity import Polarity
 from ..footage.pose_fit import PoseFit
-from ..footage.stereo_order import StereoOrder
+from ..footage.stereo_matching import StereoOrder
 from ..model.presets import preset
 from ..system.parallel import frame_threads
 from .facts import BYTES_PER_PX, Facts

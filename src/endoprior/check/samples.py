@@ -16,7 +16,7 @@ from ..footage.components import Image, InOrder, Mask
 from ..footage.depth_unit import UnitGuess, guess_unit
 from ..footage.mask_polarity import Polarity, mask_polarity
 from ..footage.pose_fit import PoseFit, RgbdFrame, measure_poses
-from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
+from ..footage.stereo_matching import StereoOrder, stereo_order, vertical_offset_px
 
 SAMPLES = 20  # frames for measurements that are expensive
 CERTAIN = 0.5  # least certainty to report masks as inverted

@@ -1,4 +1,4 @@
-"""Synthetic data, `endoprior phantom OUT` and `endoprior sample OUT`; and everything once on it, `endoprior demo [OUT]`."""
+"""Synthetic data, `endoprior phantom OUT` and `endoprior sample OUT`; everything once on it, `endoprior demo [OUT]`."""
 
 from __future__ import annotations
 

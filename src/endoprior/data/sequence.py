@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..core.config import DataConfig
 from ..core.types import Camera, Frame
-from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
 from .contents import demand_same, demand_trainable, fingerprint_of, frame_contents, state_of, weighted
 from .description import ESTIMATED_POSES, TOOLS_FOUND
+from .right_camera import right_frame
 from .scale import Scale
 from .truth import RightEye, Truth
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.ranges import evenly_spaced
 from ..footage.border import Circle, Strips
-from ..footage.stereo_order import row_offsets_px
+from ..footage.stereo_matching import row_offsets_px
 from .calibration import Calibration, Intrinsics, Size, check_pair
 from .config import Rectangle
 

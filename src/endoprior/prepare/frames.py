@@ -26,7 +26,7 @@ from ..data.pixels import is_measured
 from ..data.writer import TOOL_VALUE, FrameFiles, found_source, write_mask
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.depth_unit import guess_unit
-from ..footage.stereo_order import stereo_order, vertical_offset_px
+from ..footage.stereo_matching import stereo_order, vertical_offset_px
 from ..system.console import ToDo
 from ..system.parallel import Pool, frame_threads
 from .config import NETWORK, PrepareConfig
