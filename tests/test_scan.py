@@ -38,12 +38,12 @@ def scan(disturbed):
 def test_every_event_is_found_at_its_frames_and_nothing_else(scan, disturbed):
     events = json.loads((disturbed / "truth" / "scene.json").read_text())["events"]
     assert [event["kind"] for event in events] == ["blur", "white-out", "out-of-body", "cut"]
-    words = np.array([look.word for look in scan.looks])
+    words = np.array([frame.word for frame in scan.frames])
     for word, first, last in (("blur", 12, 17), ("overexposed", 30, 37), ("out of the body", 60, 74)):
         assert np.flatnonzero(words == word).tolist() == list(range(first, last + 1)), word
     assert {*words} == {"", "blur", "overexposed", "out of the body"}
     assert [round(time * RATE) for time in scan.cuts] == [90]
-    weights = np.array([look.weight for look in scan.looks])
+    weights = np.array([frame.weight for frame in scan.frames])
     assert ((weights < 1) == (words != "")).all()
 
 
@@ -112,7 +112,7 @@ def test_a_still_image_and_a_dark_one_are_no_video(disturbed, tmp_path):
         shutil.copy(file, tmp_path / f"{i:04d}.png")
     for i in range(len(order), len(order) + 6):
         save_png(tmp_path / f"{i:04d}.png", dark)
-    words = [look.word for look in scan_video(tmp_path, RATE).looks]
+    words = [frame.word for frame in scan_video(tmp_path, RATE).frames]
     assert words == [""] * 13 + ["repeated frames"] * 12 + [""] * 9 + ["dark"] * 6
 
 

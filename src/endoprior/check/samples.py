@@ -1,4 +1,4 @@
-"""What a few frames of a sequence tell, evenly spaced: polarity, unit, poses, the order of the eyes."""
+"""What a few frames of a sequence tell, evenly spaced: polarity, unit, poses, the order of the cameras."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def measure_stereo(sequence: FrameSequence) -> StereoFacts | None:
     return order and StereoFacts(order, float(np.median(known)) if known else float("nan"))
 
 
-def order_of_eyes(sequence: FrameSequence) -> StereoOrder | None:
+def order_of_cameras(sequence: FrameSequence) -> StereoOrder | None:
     """Which images are the left ones; None without usable right images."""
     return _mean_order(_pairs(sequence))
 

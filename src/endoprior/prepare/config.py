@@ -129,7 +129,7 @@ class PrepareConfig:
     """Also write the images of the right camera to `right/`."""
 
     @property
-    def guess(self) -> str:
+    def initial_depth(self) -> str:
         """How depth is made of single frames: `depth`, or what fills it where motion measures."""
         method, _, filler = self.depth.partition(":")
         return (filler or SHADING) if method == MOTION else self.depth

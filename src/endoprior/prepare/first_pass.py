@@ -120,9 +120,9 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
         InputError: too few or too many frames, or a file is damaged.
     """
     path, size = clip.source.path, clip.camera_size
-    indices, damaged, samples, selection, frames = _look_through(clip, cfg)
+    indices, damaged, samples, selection, frames = _decode_once(clip, cfg)
     if clip.was_damaged:  # again, now by one thread, which finds all damage
-        indices, damaged, samples, selection, frames = _look_through(clip, cfg)
+        indices, damaged, samples, selection, frames = _decode_once(clip, cfg)
     if len(indices) < 2:
         fix = "Check --start, --end and --frames-per-second."
         raise input_error(str(path), "at least 2 frames in the selection", str(len(indices)), fix)
@@ -172,7 +172,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     )
 
 
-def _look_through(
+def _decode_once(
     clip: Clip, cfg: PrepareConfig
 ) -> tuple[list[int], frozenset[int], list[StereoFrame], FrameSelection, list[StereoFrame] | None]:
     """Positions of the selected frames, the damaged ones, samples, the selection, and the frames themselves if all of
@@ -256,7 +256,7 @@ def input_facts(cfg: PrepareConfig) -> dict[str, dict[str, object]]:
     """Identity of each file and folder that an option names, by the option."""
     named = {
         "--right": cfg.right, "--calibration": cfg.calibration, "--stir": cfg.stir, "--masks": Path(cfg.masks),
-        "--depth": Path(cfg.guess), "--poses": Path(cfg.poses),
+        "--depth": Path(cfg.initial_depth), "--poses": Path(cfg.poses),
     }  # fmt: skip
     return {name: source_facts(path) for name, path in named.items() if path and kind_of(path) != "nothing"}
 

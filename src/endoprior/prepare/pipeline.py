@@ -346,7 +346,7 @@ def _use_parallax(
         )
         doubt = found.doubt
     if cfg.demands_motion and doubt:
-        raise input_error(video, "a camera whose motion tells the depth", doubt, f"Use `--depth {cfg.guess}`.")
+        raise input_error(video, "a camera whose motion tells the depth", doubt, f"Use `--depth {cfg.initial_depth}`.")
     if found is None or doubt:
         return [] if found is None else [f"depth is not measured by the motion of the camera: {doubt}"]
     delete_plan(files.folder)  # to bend depth twice would be wrong
@@ -355,13 +355,13 @@ def _use_parallax(
         return (
             index,
             files.depth_units(found.depth(index, files.depth(index))),
-            found.sureness(index, (meta.width, meta.height)),
+            found.confidence_of(index, (meta.width, meta.height)),
         )
 
     with files.frame_threads() as pool:
-        for index, units, sureness in pool.map(bend, range(files.count)):
+        for index, units, confidence in pool.map(bend, range(files.count)):
             save_png(files.file("depth", index), units)
-            files.write_image(CONFIDENCE, sureness, index)
+            files.write_image(CONFIDENCE, confidence, index)
     source = f"parallax on {found.share:.0%} of the tissue, filled by {meta.depth_source}"
     files.meta = replace(meta, depth_source=source, sources=meta.sources | {"depth": source})
     return [f"depth is measured by the motion of the camera: {source}"]

@@ -30,7 +30,7 @@ PIXEL_STD = 0.3  # of a match, px of an image 640 px wide
 DEPTH_STD = 0.2  # of the depth so far, as a share of it: it holds the scale of the path
 FOCAL_PRIOR, FOCAL_STD = 0.2, 0.03  # of log f where it is assumed; a refined one is kept if it is known this well
 MIN_OBSERVATIONS = 30  # observations of a camera; with fewer it moves along with the nearest one that has more
-SEEN_IN = 3  # frames that see a corner by which the fit is judged
+SEEN_IN = 3  # frames that see a corner by which the fit is measured
 FITS_PX = 0.5  # three quarters of the matches of a rigid scene are within this, px of an image 640 px wide
 RIGID = 0.5  # weight of a corner that follows the rigid scene
 CORNERS, MIN_IN_FRAME, MAX_IN_FRAME = 6000, 30, 150  # of all frames; at least and at most of one
@@ -155,8 +155,8 @@ def _residual(matrix: NDArray, found: Adjusted, seen: Observations) -> float:
     adjusted[[0, 1], [0, 1]] *= found.focal_factor
     here = found.poses[seen.camera], found.points[seen.point], seen.pixels, seen.inverse_depth, seen.sigma
     error = np.linalg.norm(residuals(adjusted, *here)[:, :2], axis=1)
-    judged = np.bincount(seen.point)[seen.point] >= SEEN_IN
-    return float(np.quantile(error[judged], 0.75)) if judged.any() else np.inf
+    counted = np.bincount(seen.point)[seen.point] >= SEEN_IN
+    return float(np.quantile(error[counted], 0.75)) if counted.any() else np.inf
 
 
 @dataclass(frozen=True)
