@@ -26,9 +26,9 @@ from ..footage.pose_fit import PoseFit
 from ..footage.stereo_matching import StereoOrder
 from ..model.presets import preset
 from ..system.parallel import frame_threads
-from .facts import BYTES_PER_PX, Facts
-from .finding import About, Finding, about_sequence, convert_poses, longest_part, set_values, skip
-from .samples import (
+from .facts import (
+    BYTES_PER_PX,
+    Facts,
     are_inverted,
     as_read,
     measure_polarity,
@@ -37,6 +37,7 @@ from .samples import (
     order_of_cameras,
     sample_frames,
 )
+from .finding import About, Finding, about_sequence, convert_poses, longest_part, set_values, skip
 
 TOOL_MOST = 0.6  # With a larger share of tool pixels there is too little tissue for training
 COVERED = 0.5  # Depth on a smaller share of the tissue is sparse
