@@ -67,7 +67,8 @@ def write_folder_path(
         progress=lambda done: progress(done, len(data.images)),
     )
     colors = map(data.color, range(len(data.images)))
-    unexplained = sorted({*(path.lost if path else []), *find_changes(colors).off_color})
+    lost = path.lost if path else list[int]()
+    unexplained = sorted({*lost, *find_changes(colors).off_color})
     if path is not None:
         notes += _use_path(data, path)
     if (folder / CONFIDENCE).is_dir():
