@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
+from endoprior.prepare.camera_path.tracks import FrameReader, PoseInput, TrackingCamera
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
@@ -22,8 +22,15 @@ def smooth(height, width, seed=0, sigma=2.0):
 TEXTURE = smooth(900, 900, sigma=2.5)
 
 
-def lens(relative=False, baseline_mm=4.0):
-    return TrackingCamera.centered_at_half(MATRIX, WIDTH, relative, None if relative else baseline_mm)
+def camera(relative=False, baseline_mm=4.0):
+    return TrackingCamera.centered_at_half(MATRIX, (WIDTH, HEIGHT), relative, None if relative else baseline_mm)
+
+
+def reader(frames):
+    """Reads frames that are there."""
+    return FrameReader(
+        lambda i: frames[i].rgb_u8, lambda i: frames[i].tissue_mask, lambda i: frames[i].depth, len(frames)
+    )
 
 
 def height(x, y):

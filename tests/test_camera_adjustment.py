@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from relief import lens, path, view
+from relief import camera, path, reader, view
 
 from endoprior.prepare.camera_path.adjust import (
     Observations,
@@ -18,7 +18,7 @@ from endoprior.prepare.camera_path.breathing import separate
 from endoprior.prepare.camera_path.colmap import ray_points
 from endoprior.prepare.camera_path.follow import follow_camera
 
-OPENCV = lens().matrix
+OPENCV = camera().matrix
 
 
 def scene(cameras=6, points=80, seed=0):
@@ -133,7 +133,7 @@ def test_the_pose_of_one_frame():
 
 
 def test_rays_meet_in_their_points():
-    follower = follow_camera([view(p) for p in path(8, 2.0)].__getitem__, 8, lens())
+    follower = follow_camera(reader([view(p) for p in path(8, 2.0)]), camera())
     tracks, poses = follower.tracks, np.linalg.inv(path(8, 2.0))
     world = np.random.default_rng(0).uniform([-10, -10, 75], [10, 10, 85], (tracks.count, 3))
     for f in range(8):  # what it would see of these points

@@ -15,10 +15,11 @@ from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.prepare.camera_path.features import followed, followed_directly, new_corners, tracking_frame
 from endoprior.prepare.camera_path.path import CameraPath, path_motion
 from endoprior.prepare.camera_path.sequence_path import path_depth, sequence_path
-from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera, Tracks
+from endoprior.prepare.camera_path.tracks import FrameReader, PoseInput, TrackingCamera, Tracks
 from endoprior.prepare.relative_depth import fit_shading
 
 SIZE = 320, 240
+CAMERA = TrackingCamera(np.array([[230.0, 0, 160], [0, 230.0, 120], [0, 0, 1]]), SIZE, True)
 
 
 def soft(seed, blur=9.0):
@@ -72,13 +73,8 @@ def test_static_is_said_only_where_it_was_shown():
 def test_an_unknown_motion_claims_no_poses(rests):
     images = [color(soft(1))] * rests + [color(soft(k)) for k in range(20, 32)]
     everything, depth = np.ones(SIZE[::-1], bool), np.full(SIZE[::-1], 70, np.float32)
-    lens = TrackingCamera(np.array([[230.0, 0, 160], [0, 230.0, 120], [0, 0, 1]]), SIZE[0], True)
-    path, notes = sequence_path(
-        "auto-own",
-        lambda k: PoseInput(images[k], everything, depth),
-        lambda: (images, [everything] * len(images)),
-        len(images), lens, SIZE, has_depth=True, refine_focal=False,
-    )  # fmt: skip
+    frames = FrameReader(images.__getitem__, lambda _k: everything, lambda _k: depth, len(images))
+    path, notes = sequence_path("auto-own", frames, CAMERA)
     assert path is not None and path.kind == "unknown" == path.sources({})["camera motion"]
     assert path.explained.tolist() == [k < rests and rests >= 8 for k in range(len(images))]
     assert "unknown" in notes[0] and ("one camera serves" if rests >= 8 else "no model is possible") in notes[0]
@@ -121,12 +117,11 @@ def path_of(step, turn_degrees=0.0):
     pose, motion = np.eye(4), np.eye(4)
     motion[:3, :3], motion[:3, 3] = cv2.Rodrigues(np.deg2rad([0, turn_degrees, 0]))[0], step
     poses = [pose := pose @ motion for _ in range(20)]
-    lens = TrackingCamera(np.array([[230.0, 0, 160], [0, 230.0, 120], [0, 0, 1]]), SIZE[0], True)
-    tracks = Tracks(lens)
+    tracks = Tracks(CAMERA)
     ids = tracks.add_points(np.zeros((1, 3)), keypoint=False)
     for frame in range(20):
         tracks.see(frame, ids, np.zeros((1, 2)), np.full(1, 50.0))
-    return path_motion(CameraPath(np.stack(poses), np.ones(20, bool), np.ones(20)), tracks, lens, SIZE)
+    return path_motion(CameraPath(np.stack(poses), np.ones(20, bool), np.ones(20)), tracks, CAMERA)
 
 
 def test_the_kind_of_a_path_is_where_it_leads():
@@ -146,24 +141,22 @@ def test_path_and_depth_in_a_tube_are_right_to_five_percent(tmp_path):
     images = [cv2.imread(str(f))[..., ::-1].copy() for f in sorted((tmp_path / "data/images").iterdir())]
     everything = np.ones(images[0].shape[:2], bool)
     shading = fit_shading(images[::4], [everything] * 12)
-    seen = [PoseInput(image, everything, shading.depth(image, everything)) for image in images]
+    depths = [shading.depth(image, everything) for image in images]
+    frames = FrameReader(images.__getitem__, lambda _k: everything, depths.__getitem__, 48)
     matrix = np.array([[cfg.focal, 0, cfg.center[0]], [0, cfg.focal, cfg.center[1]], [0, 0, 1]])
-    path, _ = sequence_path(
-        "auto-own", seen.__getitem__, lambda: (images, [everything] * 48), 48,
-        TrackingCamera.centered_at_half(matrix, cfg.width, True), (cfg.width, cfg.height), has_depth=True,
-        refine_focal=False,
-    )  # fmt: skip
+    camera = TrackingCamera.centered_at_half(matrix, (cfg.width, cfg.height), True)
+    path, _ = sequence_path("auto-own", frames, camera)
     true = np.load(tmp_path / "data/truth/camera_to_world.npy")
     assert path is not None and path.explained.all() and path.kind == "forward"
     length = sum(np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in pairwise(true))
     assert trajectory_errors(path.camera_to_world, true, True).ate_mm < 0.05 * length
     errors = []
     for k in range(0, 48, 6):
-        z = path_depth(path, k, np.round(seen[k].depth / 0.01).astype(np.uint16), 0.01) * 0.01
+        z = path_depth(path, k, np.round(depths[k] / 0.01).astype(np.uint16), 0.01) * 0.01
         truth = np.load(tmp_path / f"data/truth/depth/{k:06d}.npy")
         ratio = z / truth
         errors.append((np.median(ratio), np.median(np.abs(ratio / np.median(ratio) - 1))))
-        flat = seen[k].depth / truth
+        flat = depths[k] / truth
         assert errors[-1][1] < 0.6 * np.median(np.abs(flat / np.median(flat) - 1))
     assert np.mean(errors, 0)[1] < 0.05 and np.ptp(errors, 0)[0] < 0.1 * np.mean(errors, 0)[0]
     assert json.loads(json.dumps(path.record()))["camera_motion"] == "forward"

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from relief import HEIGHT, MATRIX, WIDTH, lens, path, pose, smooth, view
+from relief import HEIGHT, MATRIX, WIDTH, camera, path, pose, reader, smooth, view
 
 from endoprior.core.checks import InputError
 from endoprior.prepare.camera_path import colmap
@@ -18,8 +18,7 @@ from endoprior.prepare.camera_path.pose_file import read_poses
 from endoprior.prepare.camera_path.sequence_path import explained_share, find_path, sequence_path
 from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
 
-SIZE = (WIDTH, HEIGHT)
-OPENCV = lens().matrix
+OPENCV = camera().matrix
 
 
 def centers(paths):
@@ -40,7 +39,7 @@ def relief():
 
 def test_a_path_is_recovered(relief):
     frames, true = relief
-    found, _ = own_path(frames.__getitem__, len(frames), lens(), SIZE)
+    found, _ = own_path(reader(frames), camera())
     assert found.explained.all() and not found.still.any()
     # 25 mm long, before a relief 80 mm away; tracks of 160 px images are good to about 0.1 px.
     assert drift(found.camera_to_world, true) < 0.4
@@ -53,7 +52,7 @@ def test_relative_depth_gets_one_scale_per_frame(relief):
     frames, true = relief
     factor = 1 + 0.2 * np.sin(np.arange(24))
     wrong = [replace(seen, depth=seen.depth * np.float32(f)) for seen, f in zip(frames, factor, strict=True)]
-    found, _ = own_path(wrong.__getitem__, 24, lens(relative=True), SIZE)
+    found, _ = own_path(reader(wrong), camera(relative=True))
     product = found.depth_scale * factor
     assert np.ptp(product) / product.mean() < 0.02
     assert np.exp(np.median(np.log(found.depth_scale))) == pytest.approx(1)
@@ -67,7 +66,7 @@ def test_a_lost_camera_is_found_again(relief):
     other = [replace(frames[0], rgb_u8=smooth(HEIGHT, WIDTH, seed=9 + i)) for i in range(3)]
     order = [*range(12), *range(18, 24)]  # after the gap the camera is elsewhere
     seen = [*(frames[i] for i in order[:12]), *other, *(frames[i] for i in order[12:])]
-    found, _ = own_path(seen.__getitem__, len(seen), lens(), SIZE)
+    found, _ = own_path(reader(seen), camera())
     assert np.flatnonzero(~found.explained).tolist() == [12, 13, 14]
     assert all(np.array_equal(found.camera_to_world[i], found.camera_to_world[11]) for i in (12, 13, 14))
     kept = np.flatnonzero(found.explained)
@@ -77,7 +76,7 @@ def test_a_lost_camera_is_found_again(relief):
 def test_a_leap_is_bridged(relief):
     frames, true = relief
     order = [0, 1, 2, 3, 14, 15, 16]
-    found, _ = own_path([frames[i] for i in order].__getitem__, len(order), lens(), SIZE)
+    found, _ = own_path(reader([frames[i] for i in order]), camera())
     assert found.explained.all() and drift(found.camera_to_world, true[order]) < 1.0
 
 
@@ -88,7 +87,7 @@ def test_rests_are_copied_exactly():
     seen = [
         replace(s, rgb_u8=np.clip(s.rgb_u8 + rng.normal(0, 1.5, s.rgb_u8.shape), 0, 255).astype(np.uint8)) for s in seen
     ]
-    found, _ = own_path(seen.__getitem__, len(seen), lens(), SIZE)
+    found, _ = own_path(reader(seen), camera())
     for span in (slice(0, 12), slice(26, 38)):
         assert found.still[span].all()
         assert np.ptp(found.camera_to_world[span], axis=0).max() == 0
@@ -102,7 +101,7 @@ def test_pulled_tissue_does_not_move_the_camera():
         return lambda x, y: strength * np.exp(-((x - 5) ** 2 + y**2) / 150)[..., None] * [5.0, -3.0]
 
     seen = [view(p, move=pull(np.sin(i / 4))) for i, p in enumerate(true)]
-    found, follower = own_path(seen.__getitem__, 24, lens(), SIZE)
+    found, follower = own_path(reader(seen), camera())
     assert found.explained.all() and drift(found.camera_to_world, true) < 0.8
     weight = follower.tracks.weight[: follower.tracks.count][follower.tracks.adjusted[: follower.tracks.count]]
     assert weight.min() < 0.1 < 0.5 < np.median(weight)
@@ -110,14 +109,14 @@ def test_pulled_tissue_does_not_move_the_camera():
 
 def test_the_true_path_explains_more_than_others(relief):
     frames, _ = relief
-    found, follower = own_path(frames.__getitem__, 24, lens(), SIZE)
-    right = explained_share(follower.tracks, lens(), found)
+    found, follower = own_path(reader(frames), camera())
+    right = explained_share(follower.tracks, camera(), found)
     resting = replace(found, camera_to_world=np.tile(np.eye(4), (24, 1, 1)))
     dropped = replace(found, explained=np.arange(24) % 2 == 0)
-    assert right > 0.8 and explained_share(follower.tracks, lens(), resting) < 0.7 * right
-    assert explained_share(follower.tracks, lens(), dropped) < 0.6 * right  # half of the frames are missing
+    assert right > 0.8 and explained_share(follower.tracks, camera(), resting) < 0.7 * right
+    assert explained_share(follower.tracks, camera(), dropped) < 0.6 * right  # half of the frames are missing
     nothing = replace(found, explained=np.zeros(24, bool))
-    assert explained_share(follower.tracks, lens(), nothing) == 0
+    assert explained_share(follower.tracks, camera(), nothing) == 0
 
 
 @pytest.mark.parametrize("kind", ["black", "no depth", "all tool", "flat", "NaN depth"])
@@ -130,10 +129,10 @@ def test_frames_that_show_nothing_have_no_pose(kind, relief):
         "flat": replace(good, rgb_u8=np.full_like(good.rgb_u8, 128)),
         "NaN depth": replace(good, depth=np.full_like(good.depth, np.nan)),
     }[kind]
-    found, _ = own_path([bad, bad, bad].__getitem__, 3, lens(), SIZE)
+    found, _ = own_path(reader([bad, bad, bad]), camera())
     assert np.array_equal(found.camera_to_world, np.tile(np.eye(4), (3, 1, 1)))
     frames = [*relief[0][:5], bad, *relief[0][5:9]]
-    found, _ = own_path(frames.__getitem__, len(frames), lens(), SIZE)
+    found, _ = own_path(reader(frames), camera())
     assert np.isfinite(found.camera_to_world).all() and found.explained.sum() >= 9
 
 
@@ -163,7 +162,7 @@ def test_back_projection_inverts_projection():
 @pytest.mark.slow
 def test_the_better_path_is_taken(relief, monkeypatch):
     frames, _ = relief
-    args = frames.__getitem__, 24, lens(), SIZE
+    args = reader(frames), camera()
     monkeypatch.setattr(paths, "is_installed", lambda: False)
     own = find_path(*args)
     assert own.method == "our own tracks" and not own.notes
@@ -185,7 +184,7 @@ def test_the_better_path_is_taken(relief, monkeypatch):
 @pytest.mark.skipif(not colmap.is_installed(), reason="needs pycolmap: pip install pycolmap")
 def test_colmap_finds_the_path():
     true = path(24)
-    found = find_path([view(p) for p in true].__getitem__, 24, lens(), SIZE, "colmap")
+    found = find_path(reader([view(p) for p in true]), camera(), "colmap")
     assert found.method == "COLMAP" and found.explained.mean() > 0.9
     assert drift(found.camera_to_world, true) < 2.0
 
@@ -199,7 +198,7 @@ def test_breathing_is_not_given_to_the_camera():
         return lambda x, y: swell[i] * (1 + 0.3 * np.sin(x / 14) * np.cos(y / 12))[..., None]
 
     seen = [view(p, move=breath(i)) for i, p in enumerate(true)]
-    found, follower = own_path(seen.__getitem__, 60, lens(), SIZE)
+    found, follower = own_path(reader(seen), camera())
     assert found.breathes and 14.5 < float(re.search(r"every ([0-9.]+) frames", found.notes[0])[1]) < 15.5
     off = centers(found.camera_to_world) - centers(true)
     leaked = np.linalg.norm(off - off.mean(0), axis=1)
@@ -209,7 +208,7 @@ def test_breathing_is_not_given_to_the_camera():
 
 def test_no_breath_where_nothing_repeats(relief):
     frames, _ = relief
-    found, _ = own_path([frames[i] for i in [*range(24), *range(22, -1, -1)]].__getitem__, 47, lens(), SIZE)
+    found, _ = own_path(reader([frames[i] for i in [*range(24), *range(22, -1, -1)]]), camera())
     assert not found.breathes
 
 
@@ -225,22 +224,18 @@ def test_a_period_is_found_to_a_tenth():
     assert breathing_period(error, by_point, weight, basis, frames, 20) is None  # too short for three breaths
 
 
-def still_views(frames):
-    return lambda: ((f.rgb_u8 for f in frames), (f.tissue_mask for f in frames))
-
-
 def test_a_static_camera_has_no_path(relief):
     frames = [relief[0][0]] * 6
-    args = frames.__getitem__, still_views(frames), 6, lens(), SIZE
-    assert sequence_path("still", *args, has_depth=True, refine_focal=False) == (None, [])
-    found, _ = sequence_path("own", *args, has_depth=True, refine_focal=False)
+    args = reader(frames), camera()
+    assert sequence_path("still", *args) == (None, [])
+    found, _ = sequence_path("own", *args)
     assert np.array_equal(found.camera_to_world, np.tile(np.eye(4), (6, 1, 1))) or not found.still.any()
 
 
 def test_a_path_needs_depth(relief):
     frames, _ = relief
-    args = frames.__getitem__, still_views(frames), 24, lens(), SIZE
-    found, notes = sequence_path("auto", *args, has_depth=False, refine_focal=False)
+    args = reader(frames), camera()
+    found, notes = sequence_path("auto", *args, has_depth=False)
     assert found is None and "without depth its path cannot be estimated" in notes[0]
 
 
@@ -262,9 +257,9 @@ def test_the_principal_point_may_lie_at_the_edge_of_the_image():
     part = np.s_[:, 80:]
     cropped = [PoseInput(seen.rgb_u8[part], seen.tissue_mask[part], seen.depth[part]) for seen in map(view, true)]
     matrix = MATRIX - [[0, 0, 80], [0, 0, 0], [0, 0, 0]]
-    right = TrackingCamera.centered_at_half(matrix, WIDTH - 80, False, 4.0)
+    right = TrackingCamera.centered_at_half(matrix, (WIDTH - 80, HEIGHT), False, 4.0)
     assert right.px == (WIDTH - 80) / 640 and right.with_focal(2.0).px == right.px
-    found, _ = own_path(cropped.__getitem__, 24, right, (WIDTH - 80, HEIGHT))
+    found, _ = own_path(reader(cropped), right)
     off = found.camera_to_world[:, :3, 3] - (np.linalg.inv(true[0]) @ true)[:, :3, 3]
     assert found.explained.all() and np.linalg.norm(off, axis=1).max() < 2.0  # mm, by half of the view
 
@@ -273,7 +268,7 @@ def test_the_principal_point_may_lie_at_the_edge_of_the_image():
 def test_a_mapping_that_was_stopped_is_told_whichever_path_is_taken(monkeypatch):
     assert not colmap.time_note(59.9, 60.0) and "stopped after 60 s" in colmap.time_note(60.2, 60.0)[0]
     frames = [view(pose) for pose in path(10, 2.0)]
-    args = frames.__getitem__, len(frames), lens(), SIZE
+    args = reader(frames), camera()
     monkeypatch.setattr(paths, "is_installed", lambda: True)
     own, _ = own_path(*args)
     at_rest = np.tile(np.eye(4), (len(frames), 1, 1))
@@ -289,7 +284,7 @@ def test_auto_own_decides_as_auto_and_leaves_colmap_out(moves, monkeypatch):
     monkeypatch.setattr(paths, "is_installed", lambda: True)
     monkeypatch.setattr(paths, "colmap_path", lambda *args, **options: pytest.fail("COLMAP was asked"))
     frames = [view(pose) for pose in path(10, 2.0)] if moves else [view(path(1)[0])] * 10
-    args = frames.__getitem__, still_views(frames), len(frames), lens(), SIZE
-    found, notes = sequence_path("auto-own", *args, has_depth=True, refine_focal=False)
+    args = reader(frames), camera()
+    found, notes = sequence_path("auto-own", *args)
     assert (found is not None) == moves and ("the camera moves" in notes[0]) == moves
     assert not moves or found.method == "our own tracks"

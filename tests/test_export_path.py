@@ -147,3 +147,7 @@ def test_a_unit_may_be_given(run, data, tmp_path):
     np.savetxt(tmp_path / "cm.tum", rows)
     assert main(["poses", str(data), "--poses", str(tmp_path / "cm.tum"), "--poses-unit-mm", "10"]) == 0
     assert stored_poses(data) == pytest.approx(TRUE[:, :3], abs=1e-5)
+    rows[:, 1:4] *= 10  # mm
+    np.savetxt(tmp_path / "mm.tum", rows)
+    assert main(["poses", str(data), "--poses", str(tmp_path / "mm.tum"), "--poses-unit-mm", "1"]) == 0
+    assert stored_poses(data) == pytest.approx(TRUE[:, :3], abs=1e-5)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import write_tiny_sequence
-from relief import HEIGHT, MATRIX, WIDTH, path, pose, view
+from relief import HEIGHT, MATRIX, WIDTH, camera, path, pose, reader, view
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
@@ -270,7 +270,7 @@ def errors(found, frames, index, guess=80.0):
 
 def measured(tmp_path, frames, poses):
     flat = [replace(frame, depth=np.full((HEIGHT, WIDTH), 80, np.float32)) for frame in frames]
-    return measure_depth(flat.__getitem__, poses, np.ones(len(frames), bool), CENTERED, SIZE, tmp_path)
+    return measure_depth(reader(flat), camera(), poses, np.ones(len(frames), bool), tmp_path)
 
 
 def test_a_relief_is_measured_from_a_known_path(tmp_path):
@@ -278,7 +278,7 @@ def test_a_relief_is_measured_from_a_known_path(tmp_path):
     frames = [view(each) for each in camera_to_world]
     found = measured(tmp_path, frames, np.linalg.inv(camera_to_world))
     assert found.doubt == "" and found.frames == 1 and found.share > 0.6
-    error, sure = errors(found, frames, 6), found.resized_confidence(6, SIZE) / 255
+    error, sure = errors(found, frames, 6), found.confidence_of(6, SIZE) / 255
     assert np.median(error) < 0.01 and np.median(error[sure > 0.5]) < 0.006
     assert np.median(np.abs(80 / frames[6].depth - 1)) > 0.03  # what the guess had
 
@@ -291,7 +291,7 @@ def test_what_moves_by_itself_is_not_sure(tmp_path):
         region = lambda x, y, shift=shift: np.where(((x - 8) ** 2 + y**2 < 18**2)[..., None], shift, 0.0)  # noqa: E731
         frames.append(view(each, move=region))
     found = measured(tmp_path, frames, np.linalg.inv(camera_to_world))
-    sure = found.resized_confidence(6, SIZE) / 255
+    sure = found.confidence_of(6, SIZE) / 255
     spot, _ = project(
         np.array([8.0, 0, 80]), Camera(WIDTH, HEIGHT, 150, 150, 80, 60, np.linalg.inv(camera_to_world[6]))
     )
@@ -305,7 +305,7 @@ def test_what_is_burned_into_the_image_is_not_infinitely_far(tmp_path):
     for frame in frames:
         frame.rgb_u8[40:80, 50:110] = logo
     found = measured(tmp_path, frames, np.linalg.inv(camera_to_world))
-    assert found.resized_confidence(6, SIZE)[48:72, 58:102].max() <= 1
+    assert found.confidence_of(6, SIZE)[48:72, 58:102].max() <= 1
     assert np.median(errors(found, frames, 6)[48:72, 58:102]) < 0.1
 
 

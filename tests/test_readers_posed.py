@@ -385,7 +385,7 @@ def test_frames_without_a_pose_are_unexplained(tmp_path, capsys):
     start, words = ["prepare", str(folder / "images")], "--masks none --border keep --layout mono --depth none --poses"
     words = words.split()
     assert main([*start, str(out), *words, str(folder)]) == 0
-    assert "no camera pose, or another scene, in frames 2;" in capsys.readouterr().out
+    assert "no camera pose, or another scene, in frame 2;" in capsys.readouterr().out
     assert json.loads((out / "sequence.json").read_text())["unexplained_frames"] == [2]
     assert main([*start, str(tmp_path / "y"), *words, str(folder), "--poses-convention", "llff"]) == 2
     assert "whose axes are known" in capsys.readouterr().err

@@ -7,14 +7,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from relief import HEIGHT, WIDTH, lens, path, pose, view
+from relief import HEIGHT, WIDTH, camera, path, pose, reader, view
 
 from endoprior.prepare.camera_path import sequence_path as paths
 from endoprior.prepare.camera_path.path import CameraPath
 from endoprior.prepare.camera_path.refine import FITS_PX, match_frames, refined_path
 
 SIZE, COUNT = (WIDTH, HEIGHT), 24
-RELATIVE = lens(relative=True)
+RELATIVE = camera(relative=True)
+ASSUMED = replace(RELATIVE, focal_is_assumed=True)
 ALL = np.ones(COUNT, bool)
 
 
@@ -49,7 +50,7 @@ def turn_error(found, true):
 
 def test_a_corner_is_found_where_the_partner_sees_it_though_depth_is_a_guess(relief):
     frames, true = relief
-    found = list(match_frames(frames.__getitem__, np.linalg.inv(true), ALL, RELATIVE.matrix, SIZE))
+    found = list(match_frames(reader(frames), np.linalg.inv(true), ALL, RELATIVE.matrix, SIZE))
     matches = found[12]
     z = view(true[12]).depth[tuple(np.round(matches.pixels[:, ::-1]).astype(int).T)]
     rays = np.concatenate([matches.pixels, np.ones((len(z), 1))], 1) @ np.linalg.inv(RELATIVE.matrix).T
@@ -62,20 +63,20 @@ def test_a_corner_is_found_where_the_partner_sees_it_though_depth_is_a_guess(rel
 
 def test_a_path_that_drifts_and_a_focal_length_that_is_wrong_are_mended(relief):
     frames, true = relief
-    before, wrong = drifted(true, 0.4), RELATIVE.with_focal(1.06)
-    found = refined_path(before, frames.__getitem__, wrong, SIZE, refine_focal=True)
+    before, wrong = drifted(true, 0.4), ASSUMED.with_focal(1.06)
+    found = refined_path(before, reader(frames), wrong)
     assert found.fits and found.residual_px < 0.6 * FITS_PX
     assert turn_error(before.camera_to_world, true) > 0.3 > 0.1 > turn_error(found.path.camera_to_world, true)
     assert found.path.focal_factor == pytest.approx(1 / 1.06, rel=0.012)
     assert np.allclose(found.path.camera_to_world[0], np.eye(4))
-    fixed = refined_path(before, frames.__getitem__, RELATIVE, SIZE, refine_focal=False)
+    fixed = refined_path(before, reader(frames), RELATIVE)
     assert fixed.path.focal_factor == 1 and turn_error(fixed.path.camera_to_world, true) < 0.1
 
 
 def test_the_scale_of_each_frame_follows():
     true, factor = path(COUNT), 1 + 0.1 * np.sin(np.arange(COUNT))
     frames = [replace(view(p), depth=(view(p).depth * f).astype(np.float32)) for p, f in zip(true, factor, strict=True)]
-    found = refined_path(drifted(true, 0.0), frames.__getitem__, RELATIVE, SIZE, refine_focal=False).path
+    found = refined_path(drifted(true, 0.0), reader(frames), RELATIVE).path
     reach = np.linalg.norm(found.camera_to_world[-1, :3, 3]) / np.linalg.norm(true[-1, :3, 3] - true[0, :3, 3])
     assert np.allclose(found.depth_scale * factor, reach, rtol=0.02)
 
@@ -87,7 +88,7 @@ def test_tissue_that_moves_by_itself_fits_no_camera():
         return lambda x, y: np.stack([2.5 * np.sin(i / 2 + x / 15), 2.5 * np.cos(i / 3 + y / 12)], -1)
 
     frames = [view(p, move=pulled(i)) for i, p in enumerate(true)]
-    found = refined_path(drifted(true, 0.0), frames.__getitem__, RELATIVE, SIZE, refine_focal=False)
+    found = refined_path(drifted(true, 0.0), reader(frames), RELATIVE)
     assert not found.fits
 
 
@@ -99,7 +100,7 @@ def test_frames_of_a_rest_keep_one_pose_and_lost_frames_that_of_the_frame_before
     poses[9:14], poses[18] = poses[9], poses[17]
     seen = [frames[9] if 9 <= i < 14 else frame for i, frame in enumerate(frames)]
     before = CameraPath(poses, explained, np.ones(COUNT))
-    found = refined_path(before, seen.__getitem__, RELATIVE, SIZE, refine_focal=False).path.camera_to_world
+    found = refined_path(before, reader(seen), RELATIVE).path.camera_to_world
     assert (found[9:14] == found[9]).all() and (found[18] == found[17]).all()
     assert not (found[8] == found[9]).all()
 
@@ -107,12 +108,12 @@ def test_frames_of_a_rest_keep_one_pose_and_lost_frames_that_of_the_frame_before
 def test_without_parallax_there_is_nothing_to_adjust():
     turns = np.stack([pose((0, 0.01 * i, 0), (0, 0, 0)) for i in range(8)])
     still = CameraPath(turns, np.ones(8, bool), np.ones(8))
-    assert refined_path(still, [view(p) for p in turns].__getitem__, RELATIVE, SIZE, refine_focal=True) is None
+    assert refined_path(still, reader([view(p) for p in turns]), ASSUMED) is None
 
 
 def test_a_path_is_taken_only_if_it_fits_and_still_explains_the_tracks(relief, monkeypatch):
     frames, true = relief
-    args = frames.__getitem__, COUNT, RELATIVE, SIZE, "own"
+    args = reader(frames), RELATIVE, "own"
     found = paths.find_path(*args)
     assert any(paths.FIT in note for note in found.notes)
     assert turn_error(found.camera_to_world, true) < 0.1

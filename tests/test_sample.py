@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endoprior.cli import main
-from endoprior.cli.sample import write_sample
+from endoprior.cli.phantom import write_sample
 from endoprior.data import load_sequence
 from endoprior.phantom.camera import CameraPose
 from endoprior.phantom.raster import FAR, rasterize

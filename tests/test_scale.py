@@ -34,7 +34,7 @@ from endoprior.data.scale import (
 from endoprior.data.writer import FrameFiles, SequenceMeta, new_sequence
 from endoprior.prepare import prepare
 from endoprior.prepare.camera_path.path import CameraPath
-from endoprior.prepare.camera_path.tracks import PoseInput
+from endoprior.prepare.camera_path.tracks import FrameReader
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.folder_path import write_folder_path
 from endoprior.prepare.scale import use_scale
@@ -327,12 +327,10 @@ def test_the_path_is_scaled_with_the_depth(folder):
     poses = np.stack([POSE] * COUNT)
     path = CameraPath(poses, np.ones(COUNT, bool), np.ones(COUNT), translation_std=np.full(COUNT, 0.1))
 
-    def frame(index):
-        depth, tool = read(index)
-        return PoseInput(np.zeros((HEIGHT, WIDTH, 3), np.uint8), ~tool, depth)
-
-    assert use_scale(files, frame, path, (), 0.0) == (path, []) and files.meta is meta
-    scaled, notes = use_scale(files, frame, path, ("1,12,24,52,24,50",), 0.0)
+    black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    frames = FrameReader(lambda _i: black, lambda i: ~read(i)[1], lambda i: read(i)[0], COUNT)
+    assert use_scale(files, frames, path, (), 0.0) == (path, []) and files.meta is meta
+    scaled, notes = use_scale(files, frames, path, ("1,12,24,52,24,50",), 0.0)
     factor = files.meta.scale.factor
     assert scaled.camera_to_world[:, :3, 3] == pytest.approx(factor * poses[:, :3, 3]) and len(notes) == 1
     assert np.array_equal(scaled.camera_to_world[:, :3, :3], poses[:, :3, :3]) and poses[0, 0, 3] == 1
@@ -344,17 +342,17 @@ def test_the_path_is_scaled_with_the_depth(folder):
 def test_new_poses_that_change_depth_forget_the_scale(folder, monkeypatch):
     write_scale(folder, Scale(2.5, 0.07, "known length in frame 1"))
     found = CameraPath(np.stack([POSE] * COUNT), np.ones(COUNT, bool), np.full(COUNT, 1.1))
-    lenses = []
+    cameras = []
 
-    def moved(how, frame, views, count, lens, size, **_):
-        lenses.append(lens)
+    def moved(how, frames, camera, **_):
+        cameras.append(camera)
         return (found if how == "own" else None), []
 
     monkeypatch.setattr("endoprior.prepare.folder_path.sequence_path", moved)
     static = write_folder_path(folder, "still")
     assert load_sequence(folder).scale.factor == 2.5 and not static.relative
     done = write_folder_path(folder, "own")
-    assert lenses[0].depth_is_relative, "its shape is a guess, in mm or not"
+    assert cameras[0].depth_is_relative, "its shape is a guess, in mm or not"
     assert done.relative and load_sequence(folder).depth_is_relative and load_sequence(folder).scale is None
     assert any("the scale (known length in frame 1) is lost" in note for note in done.notes)
 

@@ -15,6 +15,7 @@ from endoprior.footage.scenes import breaks, half_stays, jumps, places_differ, s
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline.choice import choose_segment
 from endoprior.prepare.scan import scan_video
+from endoprior.prepare.scan_figure import CURVES, draw_scan
 from endoprior.prepare.segments import as_json, best_start, from_json, stretches_of
 
 RATE = 10.0
@@ -37,12 +38,12 @@ def scan(disturbed):
 def test_every_event_is_found_at_its_frames_and_nothing_else(scan, disturbed):
     events = json.loads((disturbed / "truth" / "scene.json").read_text())["events"]
     assert [event["kind"] for event in events] == ["blur", "white-out", "out-of-body", "cut"]
-    words = np.array([look.word for look in scan.looks])
+    words = np.array([frame.word for frame in scan.frames])
     for word, first, last in (("blur", 12, 17), ("overexposed", 30, 37), ("out of the body", 60, 74)):
         assert np.flatnonzero(words == word).tolist() == list(range(first, last + 1)), word
     assert {*words} == {"", "blur", "overexposed", "out of the body"}
     assert [round(time * RATE) for time in scan.cuts] == [90]
-    weights = np.array([look.weight for look in scan.looks])
+    weights = np.array([frame.weight for frame in scan.frames])
     assert ((weights < 1) == (words != "")).all()
 
 
@@ -111,7 +112,7 @@ def test_a_still_image_and_a_dark_one_are_no_video(disturbed, tmp_path):
         shutil.copy(file, tmp_path / f"{i:04d}.png")
     for i in range(len(order), len(order) + 6):
         save_png(tmp_path / f"{i:04d}.png", dark)
-    words = [look.word for look in scan_video(tmp_path, RATE).looks]
+    words = [frame.word for frame in scan_video(tmp_path, RATE).frames]
     assert words == [""] * 13 + ["repeated frames"] * 12 + [""] * 9 + ["dark"] * 6
 
 
@@ -182,3 +183,13 @@ def test_the_best_seconds_are_those_of_a_slow_loop():
         means = [float(np.mean(weights[i : i + length])) for i in range(40 - length + 1)]
         found = best_start(scanned, (0.0, 8.0), seconds)
         assert means[round(found * 5)] >= max(means) - 0.01  # the first of nearly equal ones
+
+
+@pytest.mark.parametrize("count", [5, 15, 24])
+def test_the_images_of_the_timeline_are_spread_over_the_whole_video(count, tmp_path, monkeypatch):
+    images, shown = [np.full((8, 10, 3), i, np.uint8) for i in range(count)], []
+    monkeypatch.setattr("matplotlib.axes.Axes.imshow", lambda _axes, image: shown.append(int(image.max())))
+    looks = {name: [0.5, 0.5] for name in ("seconds", "shift", *CURVES)}
+    scanned = {"seconds": 1.0, "looks": looks, "cuts": [], "segments": [], "not_usable": []}
+    draw_scan(tmp_path / "video.mp4", scanned, tmp_path / "scan.png", pictures=images)
+    assert shown[0] == 0 and shown[-1] == count - 1 and len(shown) == min(count, 8)

@@ -10,8 +10,8 @@ from endoprior.prepare.camera_path.tracks import PoseInput, TrackingCamera
 from endoprior.prepare.relative_depth import fit_shading
 
 SIZE = WIDTH, HEIGHT = 160, 128
-LENS = TrackingCamera(np.array([[140.0, 0, 79.5], [0, 140.0, 63.5], [0, 0, 1]]), WIDTH, True)
-COSINE = axial_cosine(LENS, SIZE)
+CAMERA = TrackingCamera(np.array([[140.0, 0, 79.5], [0, 140.0, 63.5], [0, 0, 1]]), SIZE, True)
+COSINE = axial_cosine(CAMERA)
 EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
 Y, X = np.mgrid[:HEIGHT, :WIDTH]
 

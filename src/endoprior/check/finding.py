@@ -56,11 +56,6 @@ class Finding:
         return f"{self.severity}: {self.code}: {self.what}. Fix: {self.fix}"
 
 
-def frame_list(frames: tuple[int, ...]) -> str:
-    """Frame numbers as text, at most six ranges: `frames 3-7, 9`."""
-    return f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames, 6)}"
-
-
 def set_values(about: About, **values: Any) -> str:
     """The edit that sets entries of `sequence.json`; it may not exist yet."""
     entries = ", ".join(f'"{name}": {value}' for name, value in values.items())

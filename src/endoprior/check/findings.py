@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..core.checks import quotation
+from ..core.checks import frame_list, quotation
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
 from ..core.shell import command
@@ -23,20 +23,21 @@ from ..footage.changes import find_cuts
 from ..footage.depth_unit import FAR_MM, UnitGuess
 from ..footage.disturbances import DARK_MEAN_GRAY
 from ..footage.pose_fit import PoseFit
-from ..footage.stereo_order import StereoOrder
+from ..footage.stereo_matching import StereoOrder
 from ..model.presets import preset
 from ..system.parallel import frame_threads
-from .facts import BYTES_PER_PX, Facts
-from .finding import About, Finding, about_sequence, convert_poses, frame_list, longest_part, set_values, skip
-from .samples import (
+from .facts import (
+    BYTES_PER_PX,
+    Facts,
     are_inverted,
     as_read,
     measure_polarity,
     measure_pose_fit,
     measure_unit,
-    order_of_eyes,
+    order_of_cameras,
     sample_frames,
 )
+from .finding import About, Finding, about_sequence, convert_poses, longest_part, set_values, skip
 
 TOOL_MOST = 0.6  # With a larger share of tool pixels there is too little tissue for training
 COVERED = 0.5  # Depth on a smaller share of the tissue is sparse
@@ -73,13 +74,13 @@ def find_errors(sequence: FrameSequence) -> list[Finding]:
         samples = sample_frames(sequence)
         polarity = measure_polarity(samples)
         unit = measure_unit(samples, polarity)
-        fit, order = measure_pose_fit(sequence, pool.map), order_of_eyes(sequence)
+        fit, order = measure_pose_fit(sequence, pool.map), order_of_cameras(sequence)
     return [
         *_swapped_masks(about, polarity),
         *_wrong_unit(about, unit, is_guess=sequence.depth_is_guessed),
         *(_wrong_poses(about, fit) if fit else ()),
         *_scene_cuts(about, cuts),
-        *(_swapped_eyes(about, order) if order else ()),
+        *(_swapped_cameras(about, order) if order else ()),
     ]
 
 
@@ -298,7 +299,7 @@ def _stereo(facts: Facts) -> Iterator[Finding]:
     stereo = facts.stereo
     if stereo is None:
         return
-    yield from _swapped_eyes(facts, stereo.order)
+    yield from _swapped_cameras(facts, stereo.order)
     if stereo.vertical_px > VERTICAL_PX:
         what = f"the rows of left and right images are {stereo.vertical_px:.1f} px apart"
         moved = facts.record and "--row-offset" in facts.record.options
@@ -393,7 +394,7 @@ def _scene_cuts(about: About, cuts: tuple[int, ...]) -> Iterator[Finding]:
         yield Finding("scene-cut", "error", what, longest_part(about, cuts), cuts)
 
 
-def _swapped_eyes(about: About, order: StereoOrder) -> Iterator[Finding]:
+def _swapped_cameras(about: About, order: StereoOrder) -> Iterator[Finding]:
     """The left images are those of the right camera."""
     if order.swapped:
         fix = "run `prepare` with `--swap-eyes`, or without it where it was given; "

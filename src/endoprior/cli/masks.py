@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from ..core.checks import input_error, number_ranges
+from ..core.checks import frame_list, input_error
 from ..core.ranges import evenly_spaced
 from ..core.shell import command
 from ..system.console import say
@@ -95,7 +95,7 @@ class Masks(Command):
         note_found_masks(self.data, count / len(rows), segmenter.name if segmenter else "")
         say(f"tools in {count} of {len(rows)} frames, at most {max(row.share for row in rows):.1%} of a frame")
         if uncertain := uncertain_frames(rows):
-            say(f"uncertain: frames {number_ranges(uncertain)}")
+            say(f"uncertain: {frame_list(uncertain)}")
 
     def _correct(self, sequence: FrameSequence) -> None:
         """Add the tools at the points of `--tool` to the masks of all frames, or free the tissue at `--tissue`."""
@@ -127,7 +127,7 @@ class Masks(Command):
             f"{'added' if adds else 'freed'} in {len(changed)} of {len(sequence)} frames, at most {most:.1%} of a frame"
         )
         if changed:
-            say(f"changed: frames {number_ranges(changed)}")
+            say(f"changed: {frame_list(changed)}")
 
 
 @contextmanager

@@ -1,4 +1,6 @@
-"""`endoprior prepare VIDEO OUT` and `endoprior poses DATA`: sequence folders from videos, and their camera paths."""
+"""Sequence folders from videos, `endoprior prepare VIDEO OUT`; their camera paths, `endoprior poses DATA`; and their
+scale, `endoprior scale DATA`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.checks import check_range, number_ranges
+from ..core.checks import check_range, frame_list, input_error
 from ..core.geometry import Convention
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
@@ -93,13 +95,14 @@ class Poses(Command):
     and explains the frames better), `own`, `colmap`, `auto-own`, `still`, or a file as for `prepare --poses`."""
     poses_convention: Convention = "opencv"
     """Meaning of the matrices in the file of --poses, as for `prepare`."""
-    poses_unit_mm: float = 1.0
-    """mm per unit of the positions in the file of --poses: 1000 for m."""
+    poses_unit_mm: float | None = None
+    """mm per unit of the positions in the file of --poses, as for `prepare`."""
 
     examples = ("DATA", "DATA --poses estimate")
 
     def __post_init__(self) -> None:
-        check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
+        if self.poses_unit_mm is not None:
+            check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
 
     def execute(self) -> None:
         """Find the camera path and write it."""
@@ -113,7 +116,7 @@ class Poses(Command):
         for note in found.notes:
             say(note_line(note))
         if found.unexplained:
-            say(f"note: no camera pose, or another scene, in frames {number_ranges(found.unexplained)}")
+            say(f"note: no camera pose, or another scene, in {frame_list(found.unexplained)}")
         if found.kept is not None:
             say(f"note: the poses that were there are kept in {found.kept}")
         if (self.data / TRUTH).exists():
@@ -134,3 +137,36 @@ def _say_errors(truth: Path, found: FolderPath) -> None:
         f"against the true path, aligned by {aligned}: {errors.ate_mm:.2f} mm (ATE), {errors.rpe_mm:.2f} mm and "
         f"{errors.rpe_deg:.3f} degrees from frame to frame, {errors.rotation_error_deg:.2f} degrees in all"
     )
+
+
+@dataclass
+class Scale(Command):
+    """Bring the relative depth of a sequence folder to mm, by something of known size in its images.
+
+    Depth, poses and known points are changed all or not at all. Another scale replaces one that was given before.
+    """
+
+    data: Path = field(metadata={"place": "DATA"})
+    """Sequence folder."""
+    known_length: tuple[str, ...] = field(default=(), metadata={"metavar": "FRAME,X1,Y1,X2,Y2,MM"})
+    """Two points of tissue, x, y in px of the frame, from 0, are MM apart. One or more; several are averaged."""
+    shaft_mm: float = field(default=0.0, metadata={"metavar": "MM"})
+    """Diameter of all instruments' shafts, most often 8 in robotic surgery, else 5. Their tips must touch tissue in
+    some frames. Less sure than --known-length."""
+
+    examples = ("DATA --known-length 12,310,205,402,198,20", "DATA --shaft-mm 8")
+
+    def execute(self) -> None:
+        """Find the scale and write it."""
+        from ..data.edit import finish_scale
+        from ..prepare.scale import scale_folder
+
+        if not (self.known_length or self.shaft_mm):
+            if finish_scale(self.data):
+                say(f"{self.data}: the scale whose change was interrupted is complete now")
+                return
+            fix = f"`{command('scale', self.data, '--known-length', '12,310,205,402,198,20')}` with your numbers."
+            raise input_error("endoprior scale", "--known-length or --shaft-mm", "neither", fix)
+        scale = scale_folder(self.data, self.known_length, self.shaft_mm)
+        say(f"{self.data}: 1 unit of relative depth is {scale.factor:.4g} mm, by {scale.text}")
+        say(f"next: `{command('check', self.data)}`")

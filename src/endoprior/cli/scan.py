@@ -56,7 +56,7 @@ class Scan(Command):
         self.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(self.out, scanned)
         figure = self.out.with_suffix(".png")
-        draw_scan(self.video, scanned, figure, self.folder_rate)
+        draw_scan(self.video, scanned, figure, self.folder_rate, scan.pictures)
         segments = segments_of(stretches)
         unusable = sum(each.seconds for each in stretches if each.reason)
         say(f"{self.video}: {scan.seconds:.1f} s, {len(segments)} segments; {unusable:.1f} s are in none")

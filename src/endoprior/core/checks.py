@@ -6,7 +6,7 @@ import difflib
 import hashlib
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,11 @@ def number_ranges(numbers: Iterable[int], most: int = 8) -> str:
             ranges.append([number, number])
     text = ", ".join(f"{first}" if first == last else f"{first}-{last}" for first, last in ranges[:most])
     return text + (f" and {len(ranges) - most} more" if len(ranges) > most else "")
+
+
+def frame_list(frames: Collection[int]) -> str:
+    """Ascending numbers of frames as text: `frames 3-5, 9`, or `frame 3`."""
+    return f"frame{'' if len(frames) == 1 else 's'} {number_ranges(frames)}"
 
 
 def read_ranges(name: str, text: str) -> frozenset[int]:

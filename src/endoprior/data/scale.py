@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import check_shape, input_error, number_ranges
+from ..core.checks import check_shape, frame_list, input_error
 from ..core.geometry import project
 from ..core.types import Camera
 from .description import SCALED
@@ -190,9 +190,8 @@ def scale_by_lengths(
     factor = float(np.exp(mean))
     demand_plausible(option, factor)
     frames = sorted({length.frame for length in lengths})
-    named = f"{'frame' if len(frames) == 1 else 'frames'} {number_ranges(frames)}"
     what = "known length" if len(lengths) == 1 else f"{len(lengths)} known lengths"
-    return Scale(factor, error, f"{what} in {named}")
+    return Scale(factor, error, f"{what} in {frame_list(frames)}")
 
 
 def scale_between(

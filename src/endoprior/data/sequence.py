@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..core.config import DataConfig
 from ..core.types import Camera, Fingerprints, Frame
-from ..footage.stereo_order import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
 from .description import ESTIMATED_POSES, TOOLS_FOUND
 from .files import demand_same, digests_of, fingerprint_of, state_of
 from .pixels import weighted
+from .right_camera import right_frame
 from .scale import Scale
 from .trainable import demand_trainable, frame_contents
 from .truth import RightEye, Truth

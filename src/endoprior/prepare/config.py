@@ -121,15 +121,15 @@ class PrepareConfig:
     poses_convention: Convention = "opencv"
     """Meaning of the matrices in the file of --poses: camera-to-world with OpenCV or OpenGL axes, or LLFF's columns
     (down, right, back); or world-to-camera. `check` tells which one fits."""
-    poses_unit_mm: float = 1.0
-    """mm per unit of the positions in the file of --poses: 1000 for m, which text has without this."""
+    poses_unit_mm: float | None = None
+    """mm per unit of the positions in the file of --poses: 1000 for m. Without it text is in m, other files in mm."""
     stir: Path | None = None
     """Folder of the STIR clip (`left/seqNN`) that VIDEO belongs to: its tattooed points become `truth/tracks.npz`."""
     keep_right: bool = False
     """Also write the images of the right camera to `right/`."""
 
     @property
-    def guess(self) -> str:
+    def initial_depth(self) -> str:
         """How depth is made of single frames: `depth`, or what fills it where motion measures."""
         method, _, filler = self.depth.partition(":")
         return (filler or SHADING) if method == MOTION else self.depth
@@ -146,10 +146,9 @@ class PrepareConfig:
             ("field_of_view_degrees", 10, 170), ("start", 0, 1e9), ("frames_per_second", 0, 1000),
             ("max_frames", 2, 1_000_000), ("max_width", 0, 16384),
             ("depth_unit_mm", 0, 1e6), ("poses_unit_mm", 1e-6, 1e6), ("working_distance_mm", 1, 1000),
-            ("shaft_mm", 0, 1000),
+            ("shaft_mm", 0, 1000), ("folder_rate", 0.01, 1000),
         ):  # fmt: skip
-            check_range(name, getattr(self, name), low, high)
-        if self.folder_rate is not None:
-            check_range("folder_rate", self.folder_rate, 0.01, 1000)
+            if (value := getattr(self, name)) is not None:
+                check_range(name, value, low, high)
         if not self.end > self.start:
             raise ValueError(f"end must be after start, got {self.end:g} and {self.start:g}")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..data.reading import kind_of
 from ..footage.border import CERTAIN as SHARP
-from ..footage.border import Outside, Strips, find_outline, hidden_by_moving_border
+from ..footage.border import Outline, Outside, Strips, find_outline, hidden_by_moving_border
 from ..footage.image_operations import dilated, square
 from ..footage.overlays import find_strokes, without_strokes
 from ..footage.round_border import CERTAIN, Circle
@@ -119,33 +119,49 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     Raises:
         InputError: too few or too many frames, or a file is damaged.
     """
-    path, size = clip.source.path, clip.camera_size
-    indices, damaged, samples, selection, frames = _look_through(clip, cfg)
+    indices, damaged, samples, selection, frames = _decode_once(clip, cfg)
     if clip.was_damaged:  # again, now by one thread, which finds all damage
-        indices, damaged, samples, selection, frames = _look_through(clip, cfg)
+        indices, damaged, samples, selection, frames = _decode_once(clip, cfg)
     if len(indices) < 2:
         fix = "Check --start, --end and --frames-per-second."
-        raise input_error(str(path), "at least 2 frames in the selection", str(len(indices)), fix)
+        raise input_error(clip.source.path, "at least 2 frames in the selection", str(len(indices)), fix)
     lefts = [frame.left for frame in samples]
-    video_notes = [*clip.notes, *_timing_notes(selection, cfg)]
-    brightest = float(np.median([np.percentile(image, 99) for image in lefts]))
-    if brightest < NEARLY_BLACK_LEVEL:
-        words = f"their brightest parts have {brightest:.0f} of 255. Export them brighter"
-        video_notes.append(f"the images are nearly black: {words}")
-    darkest = float(np.median([np.percentile(image, 1) for image in lefts]))
-    if darkest > NEARLY_WHITE_LEVEL:
-        words = f"their darkest parts have {darkest:.0f} of 255. Export them darker, or choose another part"
-        video_notes.append(f"the images are nearly white: {words}")
-    calibration, name, notes = clip.calibration, str(cfg.calibration), list[str]()
+    video_notes = [*clip.notes, *_timing_notes(selection, cfg), *_brightness_notes(lefts)]
+    outline = find_outline(without_strokes(lefts)) if cfg.border == "auto" else None
+    geometry, notes = _geometry(clip, cfg, outline)
+    if outline is not None:
+        notes += border_notes(outline.strips, outline.circle, float(1 - geometry.inside.mean()), outline.other)
+        if drawn := np.mean([find_strokes(image).any() for image in lefts]):
+            notes.append(f"boxes or text are drawn into {drawn:.0%} of the samples: masked in each frame, as no tissue")
+    if clip.calibration is None:
+        assumed = f"a field of view of {cfg.field_of_view_degrees:g} degrees is assumed"
+        focal = f"f = {geometry.matrix[0, 0]:.0f} px"
+        notes.append(
+            ToDo(f"no calibration; {assumed} ({focal}). To change it: --calibration or --field-of-view-degrees.")
+        )
+    return FirstPass(
+        indices,
+        samples,
+        geometry,
+        notes,
+        video_notes,
+        damaged,
+        clip.stored_size,
+        image_names=[file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else [],
+        hides=outline is not None,
+        moving_border=outline.other.level if outline is not None and outline.other.moves else None,
+        frames=frames,
+    )
+
+
+def _geometry(clip: Clip, cfg: PrepareConfig, outline: Outline | None) -> tuple[FrameGeometry, list[str]]:
+    """How source images become frames, inside of a detected outline if there is one; and notes on the calibration."""
+    size, calibration, name, notes = clip.camera_size, clip.calibration, str(cfg.calibration), list[str]()
     across, down = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
     if calibration is not None:
         full = size[0] * across, size[1] * down
         calibration, words = fitted(calibration, full, name, squeezed=cfg.squeezed_eyes)
-        notes += [*calibration.notes, *words]
-    strips = circle = outside = other = None
-    if cfg.border == "auto":
-        outline = find_outline(without_strokes(lefts))
-        circle, strips, outside, other = outline.circle, outline.strips or None, outline.outside, outline.other
+        notes = [*calibration.notes, *words]
     blank = [parse_rectangle(text, "--blank") for text in cfg.blank]
     for rectangle in blank:
         demand_within(rectangle, size, "--blank")
@@ -153,26 +169,26 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
         size, calibration, stereo=clip.stereo, name=name, stretch=(across, down),
         field_of_view_degrees=cfg.field_of_view_degrees, max_width=cfg.max_width,
         crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None, blank=blank,
-        strips=strips, circle=circle, outside=outside,
+        strips=outline and outline.strips, circle=outline and outline.circle, outside=outline and outline.outside,
     )  # fmt: skip
-    notes += border_notes(strips, circle, float(1 - geometry.inside.mean()), other)
-    if cfg.border == "auto" and (drawn := np.mean([find_strokes(image).any() for image in lefts])):
-        notes.append(f"boxes or text are drawn into {drawn:.0%} of the samples: masked in each frame, as no tissue")
-    if calibration is None:
-        assumed = f"a field of view of {cfg.field_of_view_degrees:g} degrees is assumed"
-        focal = f"f = {geometry.matrix[0, 0]:.0f} px"
-        notes.append(
-            ToDo(f"no calibration; {assumed} ({focal}). To change it: --calibration or --field-of-view-degrees.")
-        )
-    names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
-    level = other.level if other and other.moves else None
-    hides = cfg.border == "auto"
-    return FirstPass(
-        indices, samples, geometry, notes, video_notes, damaged, clip.stored_size, names, hides, level, frames
-    )
+    return geometry, notes
 
 
-def _look_through(
+def _brightness_notes(images: list[Image]) -> list[str]:
+    """A note if images are nearly black or nearly white."""
+    notes = []
+    brightest = float(np.median([np.percentile(image, 99) for image in images]))
+    if brightest < NEARLY_BLACK_LEVEL:
+        words = f"their brightest parts have {brightest:.0f} of 255. Export them brighter"
+        notes.append(f"the images are nearly black: {words}")
+    darkest = float(np.median([np.percentile(image, 1) for image in images]))
+    if darkest > NEARLY_WHITE_LEVEL:
+        words = f"their darkest parts have {darkest:.0f} of 255. Export them darker, or choose another part"
+        notes.append(f"the images are nearly white: {words}")
+    return notes
+
+
+def _decode_once(
     clip: Clip, cfg: PrepareConfig
 ) -> tuple[list[int], frozenset[int], list[StereoFrame], FrameSelection, list[StereoFrame] | None]:
     """Positions of the selected frames, the damaged ones, samples, the selection, and the frames themselves if all of
@@ -256,7 +272,7 @@ def input_facts(cfg: PrepareConfig) -> dict[str, dict[str, object]]:
     """Identity of each file and folder that an option names, by the option."""
     named = {
         "--right": cfg.right, "--calibration": cfg.calibration, "--stir": cfg.stir, "--masks": Path(cfg.masks),
-        "--depth": Path(cfg.guess), "--poses": Path(cfg.poses),
+        "--depth": Path(cfg.initial_depth), "--poses": Path(cfg.poses),
     }  # fmt: skip
     return {name: source_facts(path) for name, path in named.items() if path and kind_of(path) != "nothing"}
 

@@ -17,12 +17,12 @@ from ..data.files import CONFIDENCE, list_files
 from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
 from ..data.poses import POSES, depth_bounds, pose_table, read_poses_bounds
-from ..data.scale import described_scale, without_scale
+from ..data.scale import Scale, described_scale, without_scale
 from ..footage.changes import find_changes
 from ..system.atomic import write_json
 from .camera_path.path import REFINED, CameraPath
 from .camera_path.sequence_path import AS_OURS, ASSUMED, Reading, path_depth, sequence_path
-from .camera_path.tracks import PoseInput, TrackingCamera
+from .camera_path.tracks import FrameReader, TrackingCamera
 
 STATIC = "static camera"
 DEPTH_OF_OLD_PATH = "depth was measured by parallax with the path before; `endoprior prepare` measures it anew"
@@ -58,61 +58,140 @@ def write_folder_path(
         InputError: no sequence folder, read-only, or the poses named by `how` cannot be used; nothing is written.
     """
     demand_writable(folder)
-    images = list_files(folder / "images", (".png",), "EndoNeRF")
-    names = [file.stem for file in images]
-    masks, depths = (of_all_images(folder / part, names) for part in ("masks", "depth"))
-    described = read_description(folder / "sequence.json")
-    height, width = read_color(images[0]).shape[:2]
-    size, scale = (width, height), float(described.get("depth_scale", 1.0))
-    focal = _focal(folder, described, images)
-    fx, fy, cx, cy = intrinsics_of(folder / "sequence.json", described, width, height, focal)
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    tool_value, relative = described.get("mask_tool_value", 255), described.get("depth_relative", False)
-    known = described_scale(folder / "sequence.json", described)
-    guessed = relative or known is not None  # each frame's depth has a scale of its own, whether its unit is mm or not
-    sources, count = described.get("sources", {}), len(images)
-
-    def color(index: int) -> NDArray[np.uint8]:
-        return read_color(images[index], size)
-
-    def tissue(index: int) -> NDArray[np.bool_]:
-        return ~read_tool_mask(masks[index], tool_value, size)
-
+    data = _Folder.open(folder)
     path, notes = sequence_path(
         how,
-        lambda i: PoseInput(color(i), tissue(i), read_depth(depths[i], scale, size)),
-        lambda: (map(color, range(count)), map(tissue, range(count))),
-        count,
-        TrackingCamera.centered_at_half(matrix, width, guessed, described.get("baseline_mm")),
-        size,
-        has_depth=True,
-        refine_focal=sources.get("lens") in (ASSUMED, REFINED),
-        reading=replace(reading, image_times=_times(described, count), image_names=names),
-        progress=lambda done: progress(done, count),
+        data.reader,
+        data.camera,
+        reading=replace(reading, image_times=data.times, image_names=data.names),
+        progress=lambda done: progress(done, len(data.images)),
     )
+    colors = map(data.color, range(len(data.images)))
     lost = path.lost if path else list[int]()
-    unexplained = sorted({*lost, *find_changes(map(color, range(count))).off_color})
-    new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
-    if known is not None and path is not None:
-        notes.append(f"frames get other depth: the scale ({known.source}) is lost. {SCALE_AGAIN}")
-        relative, described = True, without_scale(described)
-        write_json(folder / "sequence.json", described)  # before the depth that it is wrong for
-    if relative and path is not None:
-        shaped = enumerate(depths)
-        replace_depth(folder, ((f.name, path_depth(path, i, decode_image(f, size), scale)) for i, f in shaped))
+    unexplained = sorted({*lost, *find_changes(colors).off_color})
+    if path is not None:
+        notes += _use_path(data, path)
     if (folder / CONFIDENCE).is_dir():
         notes.append(DEPTH_OF_OLD_PATH)
+    poses, kept = _write_poses(data, path, unexplained)
+    return FolderPath(poses, data.is_relative, unexplained, kept, notes)
+
+
+@dataclass
+class _Folder:
+    """The files of a sequence folder, and its description."""
+
+    path: Path
+    images: list[Path]
+    masks: list[Path]
+    depths: list[Path]
+    described: dict[str, Any]  # what `sequence.json` holds
+    size: tuple[int, int]  # (width, height), px
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy, px; the left-most pixel is centered at 0.5
+    scale: Scale | None  # by which relative depth became mm
+
+    @classmethod
+    def open(cls, path: Path) -> _Folder:
+        """Find the files; InputError if it is no sequence folder."""
+        images = list_files(path / "images", (".png",), "EndoNeRF")
+        names = [file.stem for file in images]
+        masks, depths = (of_all_images(path / part, names) for part in ("masks", "depth"))
+        description = path / "sequence.json"
+        described = read_description(description)
+        height, width = read_color(images[0]).shape[:2]
+        intrinsics = intrinsics_of(description, described, width, height, _focal(path, described, images))
+        scale = described_scale(description, described)
+        return cls(path, images, masks, depths, described, (width, height), intrinsics, scale)
+
+    @property
+    def names(self) -> list[str]:
+        return [file.stem for file in self.images]
+
+    @property
+    def times(self) -> list[float]:
+        """Of each frame, s; empty where `sequence.json` has no frame rate."""
+        rate = self.described.get("frames_per_second")
+        return [i / rate for i in range(len(self.images))] if rate else []
+
+    @property
+    def sources(self) -> dict[str, str]:
+        return self.described.get("sources", {})
+
+    @property
+    def is_relative(self) -> bool:
+        """Whether lengths have no unit."""
+        return self.described.get("depth_relative", False)
+
+    @property
+    def depth_scale(self) -> float:
+        """mm per unit of the depth files."""
+        return float(self.described.get("depth_scale", 1.0))
+
+    @property
+    def camera(self) -> TrackingCamera:
+        fx, fy, cx, cy = self.intrinsics
+        return TrackingCamera.centered_at_half(
+            np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+            self.size,
+            self.is_relative or self.scale is not None,  # each frame's depth has a scale of its own, in mm or not
+            self.described.get("baseline_mm"),
+            focal_is_assumed=self.sources.get("lens") in (ASSUMED, REFINED),
+        )
+
+    @property
+    def reader(self) -> FrameReader:
+        return FrameReader(self.color, self.tissue, self.depth, len(self.images))
+
+    def color(self, index: int) -> NDArray[np.uint8]:
+        return read_color(self.images[index], self.size)
+
+    def tissue(self, index: int) -> NDArray[np.bool_]:
+        return ~read_tool_mask(self.masks[index], self.described.get("mask_tool_value", 255), self.size)
+
+    def depth(self, index: int) -> NDArray[np.float32]:
+        return read_depth(self.depths[index], self.depth_scale, self.size)
+
+    def stored_depth(self, index: int) -> NDArray:
+        """(H, W) the numbers of a depth file."""
+        return decode_image(self.depths[index], self.size)
+
+
+def _use_path(data: _Folder, path: CameraPath) -> list[str]:
+    """Bring relative depth to the scale of the path; notes for the user."""
+    notes = []
+    if data.scale is not None:
+        notes.append(f"frames get other depth: the scale ({data.scale.source}) is lost. {SCALE_AGAIN}")
+        data.described, data.scale = without_scale(data.described), None
+        write_json(data.path / "sequence.json", data.described)  # before the depth that it is wrong for
+    if data.is_relative:
+        shaped = (
+            (file.name, path_depth(path, i, data.stored_depth(i), data.depth_scale))
+            for i, file in enumerate(data.depths)
+        )
+        replace_depth(data.path, shaped)
+    return notes
+
+
+def _write_poses(
+    data: _Folder, path: CameraPath | None, unexplained: list[int]
+) -> tuple[NDArray[np.float64], Path | None]:
+    """Write the path, or that of a static camera, and describe it; (T, 4, 4) poses, and where old ones are kept."""
+    count, (width, height), (fx, fy, cx, cy) = len(data.images), data.size, data.intrinsics
+    new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
     focal = fx * new.focal_factor
-    bounds = np.array([depth_bounds(decode_image(file, size), scale) for file in depths])
-    facts = {"width": width, "height": height, "fx": focal, "fy": fy * new.focal_factor, "cx": cx, "cy": cy}
-    still = {name: text for name, text in sources.items() if name != MOTION} | {"poses": STATIC}
-    origin = still if path is None else path.sources(sources)
-    more = facts | {"sources": origin, "unexplained_frames": unexplained}
+    bounds = np.array([depth_bounds(data.stored_depth(i), data.depth_scale) for i in range(count)])
+    still = {name: text for name, text in data.sources.items() if name != MOTION} | {"poses": STATIC}
+    facts = {
+        **{"width": width, "height": height, "fx": focal, "fy": fy * new.focal_factor, "cx": cx, "cy": cy},
+        "sources": still if path is None else path.sources(data.sources),
+        "unexplained_frames": unexplained,
+    }
     table = pose_table(new.camera_to_world, height, width, focal, bounds)
-    kept = replace_poses(folder, table, described | more, ours=sources.get("poses") in ESTIMATED_POSES)
+    ours = data.sources.get("poses") in ESTIMATED_POSES
+    kept = replace_poses(data.path, table, data.described | facts, ours=ours)
     if path is not None:
-        write_json(folder / PATH_RECORD, path.record())
-    return FolderPath(new.camera_to_world, relative, unexplained, kept, notes)
+        write_json(data.path / PATH_RECORD, path.record())
+    return new.camera_to_world, kept
 
 
 def of_all_images(folder: Path, names: list[str]) -> list[Path]:
@@ -120,12 +199,6 @@ def of_all_images(folder: Path, names: list[str]) -> list[Path]:
     files = list_files(folder, (".png",), "EndoNeRF")
     matched = match_names(folder, [file.name for file in files], range(len(names)), names)
     return [files[position] for position in matched.files.values()]
-
-
-def _times(described: dict[str, Any], count: int) -> list[float]:
-    """Of each frame, s; empty where `sequence.json` has no frame rate."""
-    rate = described.get("frames_per_second")
-    return [i / rate for i in range(count)] if rate else []
 
 
 def _focal(folder: Path, described: dict[str, Any], images: list[Path]) -> float:

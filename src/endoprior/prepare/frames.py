@@ -35,7 +35,7 @@ from ..data.pixels import is_measured
 from ..data.writer import FrameFiles
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.depth_unit import guess_unit
-from ..footage.stereo_order import stereo_order, vertical_offset_px
+from ..footage.stereo_matching import stereo_order, vertical_offset_px
 from ..system.console import ToDo
 from ..system.parallel import Pool, frame_threads
 from .config import NETWORK, PrepareConfig
@@ -109,7 +109,7 @@ def choose_methods(
             what = f"depth is relative ({source}), without a unit; its median is set to {cfg.working_distance_mm:g}"
             notes.append(ToDo(f"{what}. For mm use --known-length, a stereo video or measured depth"))
     elif kind == "folder" and measure is not None:
-        notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.guess)
+        notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.initial_depth)
     wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
     return FrameMethods(measure, shade, tools, first_pass.hidden, kind == "sgbm", wanted, sources, relative, notes)
@@ -141,12 +141,12 @@ def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
 
 def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
     """The depth method that --depth selects; InputError for --depth-relative without a depth folder."""
-    if cfg.guess == "auto":
+    if cfg.initial_depth == "auto":
         kind: DepthKind = "sgbm" if clip.stereo else "shading"
-    elif cfg.guess in ("none", "sgbm", "shading"):
-        kind = cfg.guess
+    elif cfg.initial_depth in ("none", "sgbm", "shading"):
+        kind = cfg.initial_depth
     else:
-        kind = "network" if cfg.guess.partition(":")[0] == NETWORK else "folder"
+        kind = "network" if cfg.initial_depth.partition(":")[0] == NETWORK else "folder"
     if cfg.depth_relative != "no" and kind != "folder":
         raise input_error("--depth-relative", "a folder with --depth", cfg.depth, "Remove --depth-relative.")
     return kind
@@ -163,13 +163,15 @@ def _measured_depth(
     if kind == "network":
         from .networks import DepthNetwork  # imports torch
 
-        network = DepthNetwork(cfg.guess.partition(":")[2])
+        network = DepthNetwork(cfg.initial_depth.partition(":")[2])
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
-    files, notes = match_files(Path(cfg.guess), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
+    files, notes = match_files(
+        Path(cfg.initial_depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names
+    )
     if cfg.depth_relative == "no":
         if not cfg.depth_unit_mm:
             fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
-            raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.guess}", "none", fix)
+            raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.initial_depth}", "none", fix)
         some = evenly_spaced(len(first_pass.indices), FITTED_SAMPLES)
         notes += _check_stored([read_stored(files[first_pass.indices[i]]) for i in some])
 
@@ -204,12 +206,12 @@ def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], 
 
 def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: FrameGeometry, folder: str) -> list[str]:
     """Reject depth outside the range of an endoscope; return notes on implausible depth."""
-    guess = guess_unit((d, d > 0, f.rgb_u8, geometry.inside) for f, d in zip(samples, depths, strict=True))
-    if guess.unit in ("m", "0.01 mm"):
-        fix = f"The values look like {guess.unit}: multiply --depth-unit-mm by {guess.mm_per_unit:g}."
-        raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", fix)
-    note = ToDo(f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm.")
-    return [] if guess.unit == "mm" else [note]
+    found = guess_unit((d, d > 0, f.rgb_u8, geometry.inside) for f, d in zip(samples, depths, strict=True))
+    if found.unit in ("m", "0.01 mm"):
+        fix = f"The values look like {found.unit}: multiply --depth-unit-mm by {found.mm_per_unit:g}."
+        raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{found.median:g} mm in {folder}", fix)
+    note = ToDo(f"the depth unit may be wrong: {found.reason}. Check --depth-unit-mm.")
+    return [] if found.unit == "mm" else [note]
 
 
 def _check_stored(images: list[NDArray]) -> list[str]:

@@ -1,13 +1,13 @@
-"""Depth of all frames of a clip from the motion of its camera: measured, checked, and filled by a guess.
+"""Depth of all frames of a clip from the motion of its camera: measured, checked, and filled by an initial estimate.
 
 Each frame is measured with its partners, then checked against what they measured and filled, then made steady.
 
 A measured depth is sure where its partners, measured on their own, see the same surface. Tissue or a tool that moves by
 itself has another depth for every pair of frames, so it agrees with few of them.
 
-The guess, which says how depth goes on from what is measured, is bent to it. What the logarithm of the depth lacks at
-confident pixels is spread over their neighborhood by successive corrections (Barnes 1964), from wide to narrow; what is
-left is added where it was measured.
+The initial depth, which says how depth goes on from what is measured, is bent to it. What the logarithm of the depth
+lacks at confident pixels is spread over their neighborhood by successive corrections (Barnes 1964), from wide to
+narrow; what is left is added where it was measured.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..core.types import SURE_DEPTH
 from ..system.memory import BoundedCache, cache_bytes
 from ..system.parallel import frame_threads
-from .camera_path.tracks import PoseInput
+from .camera_path.tracks import FrameReader, PoseInput, TrackingCamera
 from .camera_path.views import HighPassImage, Warp, choose_partners, scaled_size
 from .plane_sweep import FINE_WIDTH, Shot, Sweep
 
@@ -37,7 +37,7 @@ REACHES = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48, 1 / 96)  # standard deviations,
 DOUBT = 0.05  # weight of no change beside that of pixels that are sure
 MIN_CONFIDENCE = 0.1  # confidence below which a pixel does not speak
 SAME = 0.1  # difference of log depth that halves the weight of another frame: beyond, it shows another surface
-MAX_GUESS_RATIO = 3.0  # of a measured depth to the guess, after one factor for the frame; above, a chance match
+MAX_INITIAL_RATIO = 3.0  # of a measured depth to the initial one, after one factor for the frame; above, a chance match
 MIN_MEASURED_SHARE = 0.15  # of the tissue that is measured, below which the path does not tell the depth
 MIN_FRAME_SHARE = 0.5  # share of the frames that have partners, below which the camera moves too little
 BYTES_PER_PX = 400  # memory in which a thread measures a frame, bytes for each px of a fine view
@@ -48,17 +48,17 @@ AROUND = 4  # frames on each side with which the depth of a frame is averaged
 class ParallaxDepth:
     """What the motion of the camera says of the depth of `T` frames, at a small size (h, w)."""
 
-    factor: NDArray[np.float32]  # (T, h, w) that brings the guess to the depth, in the unit of the path
+    factor: NDArray[np.float32]  # (T, h, w) that brings the initial depth to the measured one, in the unit of the path
     confidence: NDArray[np.uint8]  # (T, h, w) 0 to 255
     share: float  # of the tissue that is measured
     frames: float  # share of the frames that have partners
 
-    def depth(self, index: int, guess: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) depth of a frame: the guess (H, W) bent to what is measured; 0 stays."""
-        factor = cv2.resize(self.factor[index], guess.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        return np.asarray(guess * factor, np.float32)
+    def depth(self, index: int, initial: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(H, W) depth of a frame: the initial one (H, W) bent to what is measured; 0 stays."""
+        factor = cv2.resize(self.factor[index], initial.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        return np.asarray(initial * factor, np.float32)
 
-    def resized_confidence(self, index: int, size: tuple[int, int]) -> NDArray[np.uint8]:
+    def confidence_of(self, index: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """(H, W) confidence of a frame of `size` (W, H), 0 to 255."""
         return np.asarray(cv2.resize(self.confidence[index], size, interpolation=cv2.INTER_LINEAR), np.uint8)
 
@@ -73,24 +73,22 @@ class ParallaxDepth:
 
 
 def measure_depth(
-    frame: Callable[[int], PoseInput],
+    frames: FrameReader,
+    camera: TrackingCamera,
     world_to_camera: NDArray[np.float64],
     usable: NDArray[np.bool_],
-    matrix: NDArray[np.float64],
-    size: tuple[int, int],
     folder: Path,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> ParallaxDepth:
     """Measure the depth of all frames.
 
     Args:
-        frame: reads frame i, with a guess of its depth in the unit of the path.
+        frames: with depth that is bent to what is measured, in the unit of the path.
         world_to_camera: (T, 4, 4). usable: (T,) whether a frame has a pose of its own.
-        matrix: (3, 3) K, px; the left-most pixel is centered at 0. size: (width, height), px.
         folder: for files of all frames, 19 bytes for each pixel of a small frame; made if it is not there.
         progress: is told the number of frames measured.
     """
-    count, small = len(world_to_camera), scaled_size(size, FINE_WIDTH)
+    count, size, small = frames.count, camera.size, scaled_size(camera.size, FINE_WIDTH)
     everything, shape = range(count), small[::-1]
     folder.mkdir(exist_ok=True)
 
@@ -99,16 +97,15 @@ def measure_depth(
         return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (count, *shape))
 
     measured, scores = stored("inverse_depth", np.float32), stored("correlation", np.float16)
-    confidence, filled = stored("confidence", np.uint8), stored("depth", np.float32)
-    factor = stored("factor", np.float32)
-    guesses, distance, tissue_px, shares = stored("guess", np.float32), *np.zeros((3, count))
+    initial, filled, factor = (stored(name, np.float32) for name in ("initial", "depth", "factor"))
+    confidence, (distance, tissue_px, shares) = stored("confidence", np.uint8), np.zeros((3, count))
     with frame_threads(BYTES_PER_PX * shape[0] * shape[1]) as pool:
-        for i, found in zip(everything, pool.map(lambda i: _guessed(frame(i), small), everything), strict=True):
-            guesses[i], distance[i], tissue_px[i] = found
+        for i, found in zip(everything, pool.map(lambda i: _initial(frames.frame(i), small), everything), strict=True):
+            initial[i], distance[i], tissue_px[i] = found
         usable = usable & np.isfinite(distance)
-        partners = choose_partners(world_to_camera, matrix, size, np.where(usable, distance, 1.0), usable)
-        sweep = Sweep.of(matrix, size, float(np.median(distance[usable])) if usable.any() else 1.0)
-        clip = _Clip(frame, guesses, world_to_camera, usable, partners, sweep)
+        partners = choose_partners(world_to_camera, camera.matrix, size, np.where(usable, distance, 1.0), usable)
+        sweep = Sweep.of(camera.matrix, size, float(np.median(distance[usable])) if usable.any() else 1.0)
+        clip = _Clip(frames, initial, world_to_camera, usable, partners, sweep)
         for i, found in zip(everything, pool.map(clip.measured, everything), strict=True):
             if found is not None:
                 measured[i], scores[i] = found
@@ -126,17 +123,16 @@ class _Clip:
     """The frames of a clip, one at a time."""
 
     def __init__(
-        self, frame: Callable[[int], PoseInput], guesses: NDArray, poses: NDArray, usable: NDArray,
+        self, frames: FrameReader, initial: NDArray, poses: NDArray, usable: NDArray,
         partners: list[tuple[int, ...]], sweep: Sweep,
     ) -> None:  # fmt: skip
-        self._frame, self._guesses, self._poses, self._usable = frame, guesses, poses, usable
+        self._frames, self._initial_depth, self._poses, self._usable = frames, initial, poses, usable
         self._partners, self._sweep = partners, sweep
         self._views: BoundedCache[HighPassImage] = BoundedCache(cache_bytes(), lambda view: view.detail.nbytes * 2)
 
     def view(self, i: int) -> HighPassImage:
         def seen() -> HighPassImage:
-            frame = self._frame(i)
-            return HighPassImage.of(frame.rgb_u8, frame.tissue_mask, self._sweep.size)
+            return HighPassImage.of(self._frames.color(i), self._frames.tissue(i), self._sweep.size)
 
         return self._views.get(i, seen)
 
@@ -148,33 +144,33 @@ class _Clip:
 
     def filled(self, i: int, measured: NDArray, scores: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(h, w) depth of a frame, filled, and its confidence."""
-        guess, others = np.asarray(self._guesses[i]), [j for j in self._partners[i] if self._partners[j]]
+        initial, others = np.asarray(self._initial_depth[i]), [j for j in self._partners[i] if self._partners[j]]
         if not others:
-            return guess, np.zeros_like(guess)
+            return initial, np.zeros_like(initial)
         inverse, confidence = checked(measured[i], scores[i], self._warps(i, others), [measured[j] for j in others])
         confidence *= self.view(i).usable
-        return guess * bent(guess, inverse, confidence), confidence
+        return initial * bent(initial, inverse, confidence), confidence
 
     def factor(self, i: int, filled: NDArray) -> NDArray[np.float32]:
-        """(h, w) factor of the guess, with the depth of the frames around averaged."""
+        """(h, w) factor of the initial depth, with the depth of the frames around averaged."""
         near = range(max(i - AROUND, 0), min(i + AROUND + 1, len(self._poses)))
         others = [j for j in near if j != i and self._usable[i] and self._usable[j]]
-        depth, guess = steady(filled[i], self._warps(i, others), [filled[j] for j in others]), self._guesses[i]
-        return np.divide(depth, guess, out=np.ones_like(depth), where=guess > 0)
+        depth, initial = steady(filled[i], self._warps(i, others), [filled[j] for j in others]), self._initial_depth[i]
+        return np.divide(depth, initial, out=np.ones_like(depth), where=initial > 0)
 
     def _warps(self, i: int, others: Sequence[int]) -> list[Warp]:
         sweep = self._sweep
         return [Warp.between(sweep.matrix, self._poses[i], self._poses[j], sweep.size) for j in others]
 
 
-def _guessed(seen: PoseInput, size: tuple[int, int]) -> tuple[NDArray[np.float32], float, float]:
-    """A frame at `size` (w, h): guessed depth (h, w), the middle of that on tissue, NaN where none has depth, and
+def _initial(seen: PoseInput, size: tuple[int, int]) -> tuple[NDArray[np.float32], float, float]:
+    """A frame at `size` (w, h): initial depth (h, w), the middle of that on tissue, NaN where none has depth, and
     the number of pixels of tissue.
     """
     there = seen.tissue_mask & (seen.depth > 0)
     middle = float(np.median(seen.depth[there])) if there.any() else np.nan
-    guess = np.asarray(cv2.resize(seen.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
-    return guess, middle, float(seen.tissue_mask.mean()) * size[0] * size[1]
+    initial = np.asarray(cv2.resize(seen.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+    return initial, middle, float(seen.tissue_mask.mean()) * size[0] * size[1]
 
 
 def checked(
@@ -213,20 +209,20 @@ def checked(
 
 
 def bent(
-    guess: NDArray[np.float32], inverse: NDArray[np.float32], confidence: NDArray[np.float32]
+    initial: NDArray[np.float32], inverse: NDArray[np.float32], confidence: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(h, w) factor that brings a guessed depth to the measured one.
+    """(h, w) factor that brings the initial depth to the measured one.
 
     Args:
-        guess: (h, w) depth, 0 where it is missing. inverse: (h, w) measured inverse depth.
+        initial: (h, w) depth, 0 where it is missing. inverse: (h, w) measured inverse depth.
         confidence: (h, w) of what was measured, in [0, 1].
     """
-    weight = np.where((guess > 0) & (confidence > MIN_CONFIDENCE), confidence**2, 0).astype(np.float32)
-    left = -np.log(np.maximum(inverse * np.where(guess > 0, guess, 1), np.float32(1e-6))).astype(np.float32)
+    weight = np.where((initial > 0) & (confidence > MIN_CONFIDENCE), confidence**2, 0).astype(np.float32)
+    left = -np.log(np.maximum(inverse * np.where(initial > 0, initial, 1), np.float32(1e-6))).astype(np.float32)
     field = np.full_like(left, _median(left, weight))
-    left = np.clip(left - field, -np.log(MAX_GUESS_RATIO), np.log(MAX_GUESS_RATIO)).astype(np.float32)
+    left = np.clip(left - field, -np.log(MAX_INITIAL_RATIO), np.log(MAX_INITIAL_RATIO)).astype(np.float32)
     for reach in REACHES:
-        sigma = reach * guess.shape[1]
+        sigma = reach * initial.shape[1]
         spread = cv2.GaussianBlur(left * weight, (0, 0), sigma) / (cv2.GaussianBlur(weight, (0, 0), sigma) + DOUBT)
         field, left = field + spread, left - spread
     return np.exp(field)

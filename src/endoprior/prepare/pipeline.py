@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error, number_ranges
+from ..core.checks import frame_list, input_error
 from ..core.shell import changed_options, command, quoted
 from ..data import write_stir_tracks
 from ..data.description import PATH_RECORD, SIZE_NOT_STATED, PrepareRecord
@@ -27,12 +29,12 @@ from ..data.writer import FrameFiles, SequenceMeta
 from ..footage.known_facts import KnownFacts
 from ..system.console import ToDo
 from ..system.memory import BoundedCache, cache_bytes
-from ..system.parallel import frame_threads
+from ..system.parallel import Pool, frame_threads
 from .calibration import parse_size
 from .calibration_files import read_calibration
 from .camera_path.path import CameraPath
 from .camera_path.sequence_path import ASSUMED, CALIBRATED, Reading, path_depth, sequence_path
-from .camera_path.tracks import PoseInput, TrackingCamera
+from .camera_path.tracks import FrameReader, TrackingCamera
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
@@ -43,6 +45,9 @@ from .scale import check_scale_options, demand_no_unit, use_scale
 from .source import ASSUMED_RATE
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
+
+if TYPE_CHECKING:
+    from ..tool_masks.video_segmenter import VideoSegmenter
 
 BYTES_PER_PX = 100  # memory in which a thread measures a written frame, bytes for each px
 DEPTH_SCALE = 0.01  # mm per unit of the 16-bit depth files: up to 655 mm
@@ -68,6 +73,7 @@ class _Written(FrameFiles):
 
     def __init__(self, folder: Path, meta: SequenceMeta, count: int = 0) -> None:
         super().__init__(folder, meta, count)
+        self.used: list[int] = []  # position in the source of each frame
         self._colors: BoundedCache[NDArray[np.uint8]] = BoundedCache(cache_bytes(), lambda image: image.nbytes)
 
     def color(self, index: int) -> NDArray[np.uint8]:
@@ -76,9 +82,38 @@ class _Written(FrameFiles):
     def tools(self, index: int) -> NDArray[np.bool_]:
         return read_tool_mask(self.file("masks", index))
 
-    def pose_input(self, index: int) -> PoseInput:
-        depth = read_depth(self.file("depth", index), self.meta.depth_scale)
-        return PoseInput(self.color(index), ~self.tools(index), depth)
+    def tissue(self, index: int) -> NDArray[np.bool_]:
+        return ~self.tools(index)
+
+    def depth(self, index: int) -> NDArray[np.float32]:
+        return read_depth(self.file("depth", index), self.meta.depth_scale)
+
+    @property
+    def reader(self) -> FrameReader:
+        return FrameReader(self.color, self.tissue, self.depth, self.count)
+
+    def camera(self, *, focal_is_assumed: bool) -> TrackingCamera:
+        meta = self.meta
+        size, relative = (meta.width, meta.height), meta.depth_relative
+        return TrackingCamera.centered_at_half(meta.matrix, size, relative, meta.baseline_mm, focal_is_assumed)
+
+    def frame_threads(self) -> AbstractContextManager[Pool]:
+        """Threads that measure written frames."""
+        return frame_threads(BYTES_PER_PX * self.meta.width * self.meta.height)
+
+
+@dataclass(frozen=True)
+class _FrameMarks:
+    """Which frames cannot be trained on, and how much the others count."""
+
+    damaged: list[int]
+    unexplained: list[int]  # damaged, without a pose, or of another scene than the frames that are not damaged
+    weights: NDArray[np.float64]  # (T,) less than 1 where smoke or blur lies on a frame
+
+    @property
+    def without_pose(self) -> list[int]:
+        """Not damaged, but without a pose or of another scene."""
+        return sorted({*self.unexplained} - {*self.damaged})
 
 
 def prepare(
@@ -112,53 +147,33 @@ def prepare(
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
         _demand_all_frames(cfg)
-    segmenter = None
-    if is_sam2(cfg.masks):
-        from .networks import open_sam2  # imports torch
-
-        segmenter = open_sam2(cfg.masks, "--masks")
+    segmenter = _open_segmenter(cfg)
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
-        clip, first_pass, step = _look(video, cfg, progress)
-        inside = first_pass.geometry.inside
+        clip, first_pass, step = _measure_clip(video, cfg, progress)
         methods = choose_methods(cfg, clip, first_pass, folder, progress)
         demand_no_unit(cfg.known_length, cfg.shaft_mm, methods.relative)
-        files, used = _write(folder, cfg, clip, first_pass, methods, step, progress)
-        first_pass.frames = None  # they are written now
-        if files.count < 2:
-            fix = "Change --start, --end or --drop-out-of-body."
-            raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
-        carried_notes, moving = [], []
-        if segmenter is not None:
-            carried_notes = replace_by_carried(files, segmenter, inside, methods, used, progress)
-        if cfg.masks == "auto" or segmenter is not None:
-            from .unmasked_motion import frames_with_unmasked_motion  # imports torch
-
-            rate = files.meta.frames_per_second
-            with frame_threads(BYTES_PER_PX * inside.size) as pool:
-                moving = frames_with_unmasked_motion(files.count, rate, files.color, files.tools, inside, pool.map)
-        mark_moving(folder, moving)
-        path, motion_notes = _camera_path(cfg, files, clip, first_pass, used, facts, progress)
-        damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
-        unexplained, weights = _unexplained(path, files, damaged, facts)
+        files = _write(folder, cfg, clip, first_pass, methods, step, progress)
+        mask_notes, moving = _complete_masks(files, cfg, segmenter, methods, first_pass.geometry.inside, progress)
+        path, path_notes = _camera_path(files, cfg, clip, first_pass, facts, progress)
+        marks = _mark_frames(files, path, first_pass.damaged, facts)
         if path is not None:
             _use_path(files, path)
-        motion_notes += _use_parallax(video, cfg, files, path, progress)
-        path, scale_notes = use_scale(files, files.pose_input, path, cfg.known_length, cfg.shaft_mm)
-        shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
-        (folder / FOUND).unlink(missing_ok=True)
-        files.finish(None if path is None else path.camera_to_world, unexplained, weights.tolist())
-        video_notes = [*first_pass.video_notes, *_usage_notes(damaged, len(first_pass.indices) - len(used))]
-        _record(video, cfg, first_pass.geometry, video_notes).save(folder)
-        if cfg.stir is not None:
-            write_stir_tracks(cfg.stir, folder)
-        others = sorted({*unexplained} - {*damaged})
-        if path is not None and path.is_unknown and not path.explained.any():
-            others = []  # the note on the motion says it
+        depth_notes = _use_parallax(files, path, video, cfg, progress)
+        path, scale_notes = use_scale(files, files.reader, path, cfg.known_length, cfg.shaft_mm)
+        video_notes = [*first_pass.video_notes, *_usage_notes(marks, len(first_pass.indices) - len(files.used))]
+        _finish(files, path, marks, _record(video, cfg, first_pass.geometry, video_notes), cfg.stir)
         notes = [*own_notes, *video_notes, *first_pass.notes, *methods.notes]
-        notes += [*carried_notes, *motion_notes, *scale_notes]
-        notes += _advice(out, uncertain_frames(read_rows(folder)), moving, others, files.count - len(unexplained))
+        notes += [*mask_notes, *path_notes, *depth_notes, *scale_notes, *_advice(out, files, path, marks, moving)]
     return Prepared(out, files.count, first_pass.geometry.size, notes)
+
+
+def _open_segmenter(cfg: PrepareConfig) -> VideoSegmenter | None:
+    if not is_sam2(cfg.masks):
+        return None
+    from .networks import open_sam2  # imports torch
+
+    return open_sam2(cfg.masks, "--masks")
 
 
 def _with_own_files(video: Path, cfg: PrepareConfig) -> tuple[PrepareConfig, list[str]]:
@@ -177,7 +192,7 @@ def _with_own_files(video: Path, cfg: PrepareConfig) -> tuple[PrepareConfig, lis
     return cfg, notes
 
 
-def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, FirstPass, int]:
+def _measure_clip(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, FirstPass, int]:
     """The clip, what a first pass over it found, and the usual distance between the frames that are used."""
     calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
     if calibration is not None and cfg.calibration_size:
@@ -203,11 +218,11 @@ def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, Fi
 def _write(
     folder: Path, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int,
     progress: Progress,
-) -> tuple[_Written, list[int]]:  # fmt: skip
-    """Write the frames that are not there yet; and the position in the source of every frame."""
+) -> _Written:  # fmt: skip
+    """Write the frames that are not there yet; InputError if they are too few for a sequence."""
     parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
     files = _Written(folder, _meta(clip, first_pass, methods, step), frames_done(folder, parts))
-    used = write_frames(
+    files.used = write_frames(
         first_pass.all_frames(clip),
         first_pass.geometry,
         methods,
@@ -215,9 +230,14 @@ def _write(
         keep_right=cfg.keep_right,
         on_frame=lambda done: progress("writing frames", done, len(first_pass.indices)),
     )
-    if cfg.masks == "auto" and files.count >= 2:
-        write_rows(folder, (FrameRow.of(i, methods.tools(index)) for i, index in enumerate(used)))
-    return files, used
+    first_pass.frames = None  # frees memory: they are read from files now
+    if files.count < 2:
+        fix = "Change --start, --end or --drop-out-of-body."
+        want = "at least 2 frames that show the inside of a body"
+        raise input_error(clip.source.path, want, str(files.count), fix)
+    if cfg.masks == "auto":
+        write_rows(folder, (FrameRow.of(i, methods.tools(index)) for i, index in enumerate(files.used)))
+    return files
 
 
 def _meta(clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int) -> SequenceMeta:
@@ -236,28 +256,64 @@ def _meta(clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int) -
     )
 
 
+def _complete_masks(
+    files: _Written, cfg: PrepareConfig, segmenter: VideoSegmenter | None, methods: FrameMethods,
+    inside: NDArray[np.bool_], progress: Progress,
+) -> tuple[list[str], list[int]]:  # fmt: skip
+    """Have a segmenter follow the tools, if it is asked for; notes for the user, and frames in which something moves
+    that no mask covers.
+    """
+    notes, moving = [], []
+    if segmenter is not None:
+        notes = replace_by_carried(files, segmenter, inside, methods, files.used, progress)
+    if cfg.masks == "auto" or segmenter is not None:
+        from .unmasked_motion import frames_with_unmasked_motion  # imports torch
+
+        rate = files.meta.frames_per_second
+        with files.frame_threads() as pool:
+            moving = frames_with_unmasked_motion(files.count, rate, files.color, files.tools, inside, pool.map)
+    mark_moving(files.folder, moving)
+    return notes, moving
+
+
 def _camera_path(
-    cfg: PrepareConfig, files: _Written, clip: Clip, first_pass: FirstPass, used: Sequence[int], facts: KnownFacts,
-    progress: Progress,
-) -> tuple[CameraPath | None, list[str]]:  # fmt: skip
+    files: _Written, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass, facts: KnownFacts, progress: Progress
+) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
-    meta, turn, everything = files.meta, first_pass.geometry.turn, range(files.count)
     progress("following the camera", 0, files.count)
-    # Poses of a file are those of the source's left camera, which rectification turns.
-    turn = None if np.array_equal(turn, np.eye(3)) else turn
+    turn = first_pass.geometry.turn
+    reading = Reading(
+        cfg.poses_convention,
+        cfg.poses_unit_mm,
+        # Poses of a file are those of the source's left camera, which rectification turns.
+        turn=None if np.array_equal(turn, np.eye(3)) else turn,
+        sources=files.used,
+        image_times=clip.source.times,
+        image_names=first_pass.image_names,
+    )
     return sequence_path(
         cfg.poses,
-        files.pose_input,
-        lambda: (map(files.color, everything), (~files.tools(i) for i in everything)),
-        files.count,
-        TrackingCamera.centered_at_half(meta.matrix, meta.width, meta.depth_relative, meta.baseline_mm),
-        (meta.width, meta.height),
+        files.reader,
+        files.camera(focal_is_assumed=cfg.calibration is None),
         has_depth=cfg.depth != "none",
-        refine_focal=cfg.calibration is None,
-        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used, clip.source.times, first_pass.image_names),
+        reading=reading,
         progress=lambda done: progress("following the camera", done, files.count),
         facts=facts,
     )
+
+
+def _mark_frames(
+    files: _Written, path: CameraPath | None, damaged_in_source: Collection[int], facts: KnownFacts
+) -> _FrameMarks:
+    damaged = [i for i, index in enumerate(files.used) if index in damaged_in_source]
+    whole, weights = sorted({*range(files.count)} - {*damaged}), np.ones(files.count)
+    if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
+        return _FrameMarks(damaged, damaged, weights)
+    with files.frame_threads() as pool:
+        changes = facts.find_changes(lambda: pool.map(files.color, whole), pool.map)
+    weights[whole] = changes.weights
+    other_scene = [whole[i] for i in changes.off_color]
+    return _FrameMarks(damaged, sorted({*damaged, *(path.lost if path else []), *other_scene}), weights)
 
 
 def _use_path(files: FrameFiles, path: CameraPath) -> None:
@@ -273,7 +329,7 @@ def _use_path(files: FrameFiles, path: CameraPath) -> None:
 
 
 def _use_parallax(
-    video: Path, cfg: PrepareConfig, files: _Written, path: CameraPath | None, progress: Progress
+    files: _Written, path: CameraPath | None, video: Path, cfg: PrepareConfig, progress: Progress
 ) -> list[str]:
     """Measure relative depth by the motion of the camera where it tells, and bend the depth of the frames to it."""
     if not (cfg.demands_motion or (cfg.depth == "auto" and files.meta.depth_relative)):
@@ -281,27 +337,28 @@ def _use_parallax(
     meta, doubt, found = files.meta, "the camera is still, or its path is unknown", None
     if path is not None and not path.is_unknown:
         found = measure_depth(
-            files.pose_input,
+            files.reader,
+            files.camera(focal_is_assumed=False),
             np.linalg.inv(path.camera_to_world),
             path.explained,
-            TrackingCamera.centered_at_half(meta.matrix, meta.width, meta.depth_relative).matrix,
-            (meta.width, meta.height),
             files.folder / WORK,
             lambda done: progress("depth by parallax", done, files.count),
         )
         doubt = found.doubt
     if cfg.demands_motion and doubt:
-        raise input_error(video, "a camera whose motion tells the depth", doubt, f"Use `--depth {cfg.guess}`.")
+        raise input_error(video, "a camera whose motion tells the depth", doubt, f"Use `--depth {cfg.initial_depth}`.")
     if found is None or doubt:
         return [] if found is None else [f"depth is not measured by the motion of the camera: {doubt}"]
     delete_plan(files.folder)  # to bend depth twice would be wrong
 
     def bend(index: int) -> tuple[int, NDArray[np.uint16], NDArray[np.uint8]]:
-        guess = read_depth(files.file("depth", index), meta.depth_scale)
-        confidence = found.resized_confidence(index, (meta.width, meta.height))
-        return index, files.depth_units(found.depth(index, guess)), confidence
+        return (
+            index,
+            files.depth_units(found.depth(index, files.depth(index))),
+            found.confidence_of(index, (meta.width, meta.height)),
+        )
 
-    with frame_threads(BYTES_PER_PX * meta.width * meta.height) as pool:
+    with files.frame_threads() as pool:
         for index, units, confidence in pool.map(bend, range(files.count)):
             save_png(files.file("depth", index), units)
             files.write_image(CONFIDENCE, confidence, index)
@@ -310,45 +367,43 @@ def _use_parallax(
     return [f"depth is measured by the motion of the camera: {source}"]
 
 
-def _unexplained(
-    path: CameraPath | None, files: _Written, damaged: list[int], facts: KnownFacts
-) -> tuple[list[int], NDArray[np.float64]]:
-    """Damaged frames, and those without a pose or of another scene than the frames that are not damaged; and weights of
-    all frames, less than 1 where smoke or blur lies on them.
-    """
-    whole, weights = sorted({*range(files.count)} - {*damaged}), np.ones(files.count)
-    if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
-        return damaged, weights
-    with frame_threads(BYTES_PER_PX * files.meta.width * files.meta.height) as pool:
-        changes = facts.find_changes(lambda: pool.map(files.color, whole), pool.map)
-    weights[whole] = changes.weights
-    other_scene = [whole[i] for i in changes.off_color]
-    return sorted({*damaged, *(path.lost if path else []), *other_scene}), weights
+def _finish(
+    files: _Written, path: CameraPath | None, marks: _FrameMarks, record: PrepareRecord, stir: Path | None
+) -> None:
+    """Describe the sequence, and delete what was needed on the way."""
+    shutil.rmtree(files.folder / WORK, ignore_errors=True)
+    (files.folder / FOUND).unlink(missing_ok=True)
+    files.finish(None if path is None else path.camera_to_world, marks.unexplained, marks.weights.tolist())
+    record.save(files.folder)
+    if stir is not None:
+        write_stir_tracks(stir, files.folder)
 
 
-def _usage_notes(damaged: list[int], outside: int) -> list[str]:
+def _usage_notes(marks: _FrameMarks, outside: int) -> list[str]:
     notes = []
-    if damaged:
+    if marks.damaged:
         what = "damaged in the video, or predicted from damaged images before the next key frame"
         fix = "leave them out with --start and --end, or copy the video again"
-        where = f"frames {number_ranges(damaged)}. They are unexplained_frames of sequence.json"
+        where = f"{frame_list(marks.damaged)}. They are unexplained_frames of sequence.json"
         notes.append(ToDo(f"{what}: {where}; {fix}"))
     if outside:
         notes.append(f"{outside} frames without the color of the inside of a body are left out")
     return notes
 
 
-def _advice(out: Path, uncertain: list[int], moving: list[int], others: list[int], usable: int) -> list[str]:
+def _advice(out: Path, files: _Written, path: CameraPath | None, marks: _FrameMarks, moving: list[int]) -> list[str]:
     """Notes on frames to look at: of unsure masks, of likely missed tools, without a pose."""
     notes, correct = [], f"To look and correct: {command('view', out)}"
-    if uncertain:
-        notes.append(f"masks: unsure in frames {number_ranges(uncertain)}. {correct}")
+    if uncertain := uncertain_frames(read_rows(files.folder)):
+        notes.append(f"masks: unsure in {frame_list(uncertain)}. {correct}")
     if moving:
-        what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
+        what = f"in {frame_list(moving)}, something moves that no mask covers"
         notes.append(f"masks: tools are likely missed: {what}. {correct}")
-    if others:
+    is_noted = path is not None and path.is_unknown and not path.explained.any()  # by the note on the motion
+    if marks.without_pose and not is_noted:
+        usable = files.count - len(marks.unexplained)
         fix = "look at the images: is this one video?" if usable < 2 else "--start and --end can leave them out"
-        notes.append(f"no camera pose, or another scene, in frames {number_ranges(others)}; {fix}")
+        notes.append(f"no camera pose, or another scene, in {frame_list(marks.without_pose)}; {fix}")
     return notes
 
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from ..data.scale import (
 from ..data.writer import FrameFiles
 from ..footage.border import find_outline, masked_border
 from .camera_path.path import CameraPath
-from .camera_path.tracks import PoseInput
+from .camera_path.tracks import FrameReader
 from .folder_path import of_all_images
 from .shaft import frontier, tip_readings
 
@@ -37,7 +37,6 @@ SAMPLES = 16  # number of frames in which the border of the view is looked for
 MIN_MM, MAX_MM = 1.0, 20.0
 """Range of diameters of shafts."""
 KNOW_OTHERWISE = "give a length that you know: `--known-length FRAME,X1,Y1,X2,Y2,MM`."
-Frame = Callable[[int], PoseInput]
 
 
 def check_scale_options(known_length: Sequence[str], shaft_mm: float) -> None:
@@ -52,13 +51,11 @@ def check_scale_options(known_length: Sequence[str], shaft_mm: float) -> None:
         raise input_error("--known-length", f"no {SHAFT_OPTION}", f"{SHAFT_OPTION} {shaft_mm:g}", fix)
 
 
-def find_scale(
-    frame: Frame, count: int, matrix: NDArray[np.float64], known_length: Sequence[str], shaft_mm: float
-) -> Scale:
+def find_scale(frames: FrameReader, matrix: NDArray[np.float64], known_length: Sequence[str], shaft_mm: float) -> Scale:
     """The scale that one of the options gives.
 
     Args:
-        frame: reads frame i of `count`, with relative depth.
+        frames: with relative depth.
         matrix: (3, 3) K, px, with the left-most pixel centered at 0.5.
         known_length: texts `FRAME,X1,Y1,X2,Y2,MM`.
         shaft_mm: diameter of the shafts, mm; 0: not given.
@@ -69,25 +66,24 @@ def find_scale(
     if known_length:
 
         def read(index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-            seen = frame(index)
-            return seen.depth, ~seen.tissue_mask
+            return frames.depth(index), ~frames.tissue(index)
 
-        return scale_by_lengths([parse_known_length(text) for text in known_length], read, count, matrix)
-    return scale_by_shafts(frame, count, matrix, shaft_mm)
+        return scale_by_lengths([parse_known_length(text) for text in known_length], read, frames.count, matrix)
+    return scale_by_shafts(frames, matrix, shaft_mm)
 
 
-def scale_by_shafts(frame: Frame, count: int, matrix: NDArray[np.float64], shaft_mm: float) -> Scale:
+def scale_by_shafts(frames: FrameReader, matrix: NDArray[np.float64], shaft_mm: float) -> Scale:
     """The scale at which the tips of instruments touch tissue where they do, of shafts with this diameter, mm.
 
     Raises:
         InputError: no tool in the masks, or no shaft that is straight and long enough.
     """
-    samples = [frame(i) for i in evenly_spaced(count, SAMPLES)]
-    images = [seen.rgb_u8 for seen in samples]
-    outside = masked_border(find_outline(images), images, (seen.tissue_mask for seen in samples))
+    count, samples = frames.count, evenly_spaced(frames.count, SAMPLES)
+    images = [frames.color(i) for i in samples]
+    outside = masked_border(find_outline(images), images, map(frames.tissue, samples))
     readings, with_tools = [], 0
     for i in range(count):
-        seen = frame(i)
+        seen = frames.frame(i)
         tools = ~seen.tissue_mask & ~outside
         with_tools += bool(tools.any())
         readings += tip_readings(i, tools, outside, seen.rgb_u8, seen.depth, matrix, shaft_mm / 2)
@@ -111,7 +107,7 @@ def demand_no_unit(known_length: Sequence[str], shaft_mm: float, relative: bool)
 
 
 def use_scale(
-    files: FrameFiles, frame: Frame, path: CameraPath | None, known_length: Sequence[str], shaft_mm: float
+    files: FrameFiles, frames: FrameReader, path: CameraPath | None, known_length: Sequence[str], shaft_mm: float
 ) -> tuple[CameraPath | None, list[str]]:
     """Find the scale of written frames, and put it into their description; the path in mm, and notes.
 
@@ -120,7 +116,7 @@ def use_scale(
     if not (known_length or shaft_mm):
         return path, []
     meta = files.meta
-    scale = find_scale(frame, files.count, meta.matrix, known_length, shaft_mm)
+    scale = find_scale(frames, meta.matrix, known_length, shaft_mm)
     files.meta = replace(meta, depth_scale=meta.depth_scale * scale.factor, depth_relative=False, scale=scale)
     if path is not None:
         moved = path.camera_to_world.copy()
@@ -154,11 +150,13 @@ def scale_folder(folder: Path, known_length: Sequence[str], shaft_mm: float) -> 
     depths, first = of_all_images(folder / "depth", sequence.image_names), sequence.camera(0)
     size = (first.width, first.height)
 
-    def frame(index: int) -> PoseInput:
-        seen = sequence.frame(index)
-        return PoseInput(seen.rgb_u8, seen.tissue_mask, read_depth(depths[index], unit, size))
-
+    frames = FrameReader(
+        lambda i: sequence.frame(i).rgb_u8,
+        lambda i: sequence.frame(i).tissue_mask,
+        lambda i: read_depth(depths[i], unit, size),
+        len(sequence),
+    )
     matrix = np.array([[first.fx, 0, first.cx], [0, first.fy, first.cy], [0, 0, 1]])
-    scale = find_scale(frame, len(sequence), matrix, known_length, shaft_mm)
+    scale = find_scale(frames, matrix, known_length, shaft_mm)
     write_scale(folder, scale)
     return scale

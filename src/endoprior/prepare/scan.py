@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -30,9 +30,8 @@ from ..footage.scenes import (
 )
 from .source import open_source, quick_images
 
-LOOKS, RATES = 2400, (2.0, 10.0)
-"""So many images are looked at, if that is not less or more than these rates, 1/s."""
-PICTURES = 8  # of these, for the timeline
+NUM_FRAMES, RATES = 2400, (2.0, 10.0)
+"""So many images are measured, if that is not less or more than these rates, 1/s."""
 NUM_SAMPLE_IMAGES = 24  # images that show which part of the frame is the endoscope's image
 BACK_S = 3.0  # tissue is looked for in the images of so long before, s
 BACK = (1, 2, 5, 12, 28)  # how many images before; each costs a comparison of features
@@ -43,8 +42,8 @@ OUTSIDE, FROZEN_WORDS = "out of the body", "repeated frames"
 
 
 @dataclass(frozen=True)
-class Look:
-    """One image that was looked at."""
+class ScannedFrame:
+    """One image that was measured."""
 
     seconds: float  # since the first image
     quality: FrameQuality
@@ -58,10 +57,10 @@ class Scan:
     """What a video shows."""
 
     seconds: float  # duration
-    rate: float  # looks a second, at most
-    looks: list[Look]
+    rate: float  # frames measured a second, at most
+    frames: list[ScannedFrame]
     cuts: list[float]  # times of the first images after cuts, s
-    pictures: list[Image]  # a few small images (h, w, 3), spread over it
+    pictures: list[Image]  # a few small images (h, w, 3), evenly spaced
 
 
 def scan_video(
@@ -82,70 +81,74 @@ def scan_video(
         for each in source.sample_images(0.0, source.seconds, NUM_SAMPLE_IMAGES)
     ]
     inside = view_mask(pictures)
-    rate = float(np.clip(LOOKS / max(source.seconds, 1e-3), *RATES))
-    watch, looks, frozen = _Watch(inside, rate), list[Look](), list[float]()
-    times, changes, positions = list[float](), list[float](), list[int]()  # of every image; looks before each
+    rate = float(np.clip(NUM_FRAMES / max(source.seconds, 1e-3), *RATES))
+    watch, frames, frozen = _Watch(inside, rate), list[ScannedFrame](), list[float]()
+    times, changes, positions = list[float](), list[float](), list[int]()  # of every image; frames before each
     thumbs, refuted, before = deque[NDArray[np.float32]](maxlen=2 * REACH), set[int](), None
     for seconds, image in quick_images(source):
         now = standardized(image(THUMB_WIDTH, max(round(THUMB_WIDTH * size[1] / size[0]), 1), is_gray=True))
         times.append(seconds)
         changes.append(change(thumbs[-1], now) if thumbs else 0.0)
-        positions.append(len(looks))
+        positions.append(len(frames))
         thumbs.append(now)
         if len(changes) >= REACH and changes[-REACH] > JUMP:
             around = list(thumbs)
             if not places_differ(around[:-REACH], around[-REACH:]):
                 refuted.add(len(changes) - REACH)
-        if looks and seconds < looks[-1].seconds + 1 / rate - 1e-6:
+        if frames and seconds < frames[-1].seconds + 1 / rate - 1e-6:
             continue
         small = image(*size)
         frozen.append(np.inf if before is None else float(cv2.absdiff(small, before).mean()))
         before = small
         link = watch.link(np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8))
-        looks.append(Look(seconds, measure_quality(small, inside), link))
+        frames.append(ScannedFrame(seconds, measure_quality(small, inside), link))
         progress(seconds, source.seconds)
-    sudden = np.zeros(len(looks) + 1, bool)
-    first_after = np.full(len(looks) + 1, np.inf)
+    sudden = np.zeros(len(frames) + 1, bool)
+    first_after = np.full(len(frames) + 1, np.inf)
     for i in set(np.flatnonzero(jumps(np.array(times), np.array(changes))).tolist()) - refuted:
         sudden[positions[i]] = True
         first_after[positions[i]] = min(first_after[positions[i]], times[i])
-    is_cut = breaks(len(looks), watch.pairs) & sudden[: len(looks)]
+    is_cut = breaks(len(frames), watch.pairs) & sudden[: len(frames)]
     cuts = [float(first_after[i]) for i in np.flatnonzero(is_cut)]
     duration = max(source.seconds, times[-1] if times else 0.0)
     return Scan(
         duration,
         rate,
-        _judged(looks, is_cut, connected(len(looks), watch.pairs), np.array(frozen) < FROZEN, rate),
+        _with_disturbances(frames, is_cut, connected(len(frames), watch.pairs), np.array(frozen) < FROZEN, rate),
         cuts,
-        pictures[:: max(len(pictures) // PICTURES, 1)][:PICTURES],
+        pictures,
     )
 
 
-def _judged(
-    looks: list[Look], is_cut: NDArray[np.bool_], place: NDArray[np.integer], same: NDArray[np.bool_], rate: float
-) -> list[Look]:
-    """The looks with what is wrong with each.
+def _with_disturbances(
+    frames: list[ScannedFrame],
+    is_cut: NDArray[np.bool_],
+    place: NDArray[np.integer],
+    same: NDArray[np.bool_],
+    rate: float,
+) -> list[ScannedFrame]:
+    """The frames with what is wrong with each.
 
     Args:
-        place: a number for each set of looks at the same tissue. same: whether a look repeats the one before.
+        place: a number for each set of frames of the same tissue. same: whether a frame repeats the one before.
     """
-    seconds, measured = np.array([look.seconds for look in looks]), [look.quality for look in looks]
+    seconds, measured = np.array([frame.seconds for frame in frames]), [frame.quality for frame in frames]
     scene = np.cumsum(is_cut, dtype=np.int64)
     words, weights = disturbances(seconds, measured, scene)
     outside = scenes_outside(measured, place)
-    for i in range(len(looks)):
+    for i in range(len(frames)):
         if place[i] in outside:
             words[i], weights[i] = OUTSIDE, 0.0
     for first, end in runs(np.array(words) == ""):  # a clear image between two of the same smoke is in it
-        lasts = seconds[min(end, len(looks) - 1)] - seconds[first]
-        if 0 < first and end < len(looks) and lasts < GAP_S and scene[first - 1] == scene[end]:
+        lasts = seconds[min(end, len(frames) - 1)] - seconds[first]
+        if 0 < first and end < len(frames) and lasts < GAP_S and scene[first - 1] == scene[end]:
             words[first:end] = [words[first - 1]] * (end - first)
     for first, end in runs(same):
         if seconds[end - 1] - seconds[first] >= FROZEN_S - 1 / rate:
             words[first:end] = [word or FROZEN_WORDS for word in words[first:end]]
     return [
-        Look(look.seconds, look.quality, look.link, word, float(weight))
-        for look, word, weight in zip(looks, words, weights, strict=True)
+        replace(frame, word=word, weight=float(weight))
+        for frame, word, weight in zip(frames, words, weights, strict=True)
     ]
 
 

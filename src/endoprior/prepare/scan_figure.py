@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from ..core.ranges import evenly_spaced
 from ..visualization.image_tools import save_figure
-from .scan import PICTURES
 from .segments import WORDS, best_segment, from_json, segments_of
 from .source import open_source
 
+NUM_IMAGES = 8
 GOOD, BEST = "#8fc98f", "#2e8b57"
 COLORS: dict[str, str] = dict(
     zip(WORDS, ("#9e9e9e", "#c9a227", "#222222", "#f2d16b", "#4a78b5", "#b58ad1", "#d62728", "#e0c9c9"), strict=True)
@@ -41,11 +42,11 @@ def draw_scan(
     figure = Figure(figsize=(15, 8), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 3]).flat
-    pictures = pictures or open_source(video, folder_rate).sample_images(0.0, whole, PICTURES)
-    for axis in np.atleast_1d(top.subplots(1, PICTURES)):
+    pictures = pictures or open_source(video, folder_rate).sample_images(0.0, whole, NUM_IMAGES)
+    for axis in np.atleast_1d(top.subplots(1, NUM_IMAGES)):
         axis.set_axis_off()
-    for axis, image in zip(top.axes, pictures, strict=False):
-        axis.imshow(image)
+    for axis, i in zip(top.axes, evenly_spaced(len(pictures), NUM_IMAGES), strict=False):
+        axis.imshow(pictures[i])
     bar, curves, motion = bottom.subplots(3, 1, sharex=True, height_ratios=[1, 2, 1.2])
     segments = segments_of(stretches)
     best = best_segment(segments) if segments else -1

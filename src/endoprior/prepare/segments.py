@@ -13,7 +13,7 @@ from ..core.checks import input_error
 from ..data.reading import of_type, read_json, read_parts
 from ..footage.disturbances import FrameQuality
 from ..footage.image_operations import runs
-from .scan import Look, Scan
+from .scan import Scan, ScannedFrame
 
 SHORTEST_S = 1.0  # a segment is at least so long, s
 TOLERATED_S = 0.5  # a disturbance that is shorter does not end a segment, s
@@ -43,15 +43,15 @@ class Stretch:
 
 def stretches_of(scan: Scan) -> list[Stretch]:
     """The whole video in stretches, in order."""
-    looks = scan.looks
-    if not looks:
+    frames = scan.frames
+    if not frames:
         return []
     edges = [0.0, *scan.cuts, scan.seconds]
-    times = np.array([look.seconds for look in looks])
+    times = np.array([frame.seconds for frame in frames])
     found = list[Stretch]()
     for start, end in pairwise(edges):
         first, last = np.searchsorted(times, [start - 1e-6, end - 1e-6])
-        found += _of_scene(looks[first:last], start, end)
+        found += _of_scene(frames[first:last], start, end)
     return found
 
 
@@ -65,15 +65,15 @@ def best_segment(segments: list[Stretch]) -> int:
     return max(range(len(segments)), key=lambda i: (round(segments[i].score, 2), -i))
 
 
-def _of_scene(looks: list[Look], start: float, end: float) -> list[Stretch]:
+def _of_scene(frames: list[ScannedFrame], start: float, end: float) -> list[Stretch]:
     """The stretches between two cuts."""
-    if not looks:
+    if not frames:
         return [Stretch(start, end, SHORT)]
-    words = [look.word for look in looks]
-    edges = [start, *(look.seconds for look in looks[1:]), end]  # look i stands for the time from edge i to edge i + 1
+    words = [frame.word for frame in frames]
+    edges = [start, *(frame.seconds for frame in frames[1:]), end]  # frame i lasts from edge i to edge i + 1
     disturbed = np.array([bool(word) for word in words])
     for first, last in runs(disturbed):
-        if edges[last] - edges[first] < TOLERATED_S and 0 < first and last < len(looks):
+        if edges[last] - edges[first] < TOLERATED_S and 0 < first and last < len(frames):
             disturbed[first:last] = False
     found = list[Stretch]()
     for is_bad, first, last in sorted(
@@ -85,7 +85,7 @@ def _of_scene(looks: list[Look], start: float, end: float) -> list[Stretch]:
         elif end - start < SHORTEST_S:
             found.append(Stretch(start, end, SHORT))
         else:
-            found.append(_segment(looks[first:last], edges[first : last + 1]))
+            found.append(_segment(frames[first:last], edges[first : last + 1]))
     return found
 
 
@@ -102,13 +102,13 @@ def _not_usable(words: list[str], edges: list[float]) -> list[Stretch]:
     return found
 
 
-def _segment(looks: list[Look], edges: list[float]) -> Stretch:
+def _segment(frames: list[ScannedFrame], edges: list[float]) -> Stretch:
     """A segment with its score and its best part."""
     lasts = np.diff(edges)
-    known = np.array([look.link is not None for look in looks])
+    known = np.array([frame.link is not None for frame in frames])
     known[:1] = True  # the first image follows nothing
     worth = np.concatenate(
-        [[0.0], np.cumsum(lasts * [look.weight for look in looks] * np.where(known, 1, UNKNOWN_MOTION))]
+        [[0.0], np.cumsum(lasts * [frame.weight for frame in frames] * np.where(known, 1, UNKNOWN_MOTION))]
     )
     ends = np.searchsorted(edges, np.array(edges) + LONGEST_S + 1e-6, side="right") - 1
     scores = worth[ends] - worth
@@ -139,14 +139,14 @@ def as_json(scan: Scan) -> dict[str, Any]:
         ],
         "cuts": [round(time, 3) for time in scan.cuts],
         "looks": {
-            "seconds": [round(look.seconds, 3) for look in scan.looks],
-            "problem": [look.word for look in scan.looks],
-            "weight": [round(look.weight, 3) for look in scan.looks],
-            "shift": [None if look.link is None else round(look.link.shift, 4) for look in scan.looks],
-            "residual": [None if look.link is None else round(look.link.residual, 5) for look in scan.looks],
+            "seconds": [round(frame.seconds, 3) for frame in scan.frames],
+            "problem": [frame.word for frame in scan.frames],
+            "weight": [round(frame.weight, 3) for frame in scan.frames],
+            "shift": [None if frame.link is None else round(frame.link.shift, 4) for frame in scan.frames],
+            "residual": [None if frame.link is None else round(frame.link.residual, 5) for frame in scan.frames],
             **{
-                name: [round(look.quality[k], 4) for look in scan.looks]
-                for k, name in enumerate(scan.looks[0].quality._fields if scan.looks else ())
+                name: [round(frame.quality[k], 4) for frame in scan.frames]
+                for k, name in enumerate(scan.frames[0].quality._fields if scan.frames else ())
             },
         },
     }  # fmt: skip

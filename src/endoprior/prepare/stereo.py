@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_range
-from ..footage.stereo_order import disagreement, match_both_ways
+from ..footage.stereo_matching import disagreement, match_both_ways
 from ..priors.specular import specular_likelihood
 
 MATCHING_WIDTH = 960

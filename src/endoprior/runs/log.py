@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
-from ..core.checks import InputError, input_error, number_ranges
+from ..core.checks import InputError, frame_list, input_error
 from ..core.config_io import from_dict
 from ..core.shell import command, missing_package
 from ..data.found_tools import read_rows
@@ -178,9 +178,8 @@ def missed_tools_line(run: Path, data: Path) -> str:
         moving = set()
     if not (frames := sorted({*met, *moving})):
         return ""
-    words = f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames)}"
     steps = f"`{command('view', data)}`, then `{command('train', data, 'RUN')}`"
-    return f"Tools are likely missed in {words}. To look and correct: {steps}."
+    return f"Tools are likely missed in {frame_list(frames)}. To look and correct: {steps}."
 
 
 def _config(run: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import number_ranges
+from ..core.checks import frame_list, number_ranges
 from ..data import FrameSequence
 from ..data.edit import replace_masks
 from ..data.found_tools import drop_rows
@@ -284,7 +284,7 @@ class MaskEditor:
         self._search = None
         if found:
             self.edits.change(found, paint)
-        self._say(f"{'Found' if paint else 'Freed'} in {_frames(sorted(found))}." if found else "Nothing was found.")
+        self._say(f"{'Found' if paint else 'Freed'} in {frame_list(sorted(found))}." if found else "Nothing was found.")
 
     # Buttons.
 
@@ -306,16 +306,11 @@ class MaskEditor:
     def save(self) -> None:
         """Write the changed masks; raises InputError if they cannot be written."""
         frames = self.edits.save()
-        self._say(f"Saved: {_frames(frames)}." if frames else "Nothing to save.")
+        self._say(f"Saved: {frame_list(frames)}." if frames else "Nothing to save.")
 
     def _say(self, text: str) -> None:
         """Show a text and which masks are not saved."""
         unsaved = self.edits.unsaved
-        lines = [text, f"Not saved: {_frames(unsaved)}." if unsaved else ""]
+        lines = [text, f"Not saved: {frame_list(unsaved)}." if unsaved else ""]
         self._controls.corrected.content = "  \n".join(filter(None, lines))
         self._changed()
-
-
-def _frames(numbers: list[int]) -> str:
-    """Such as `frames 3-5, 9`."""
-    return f"frame{'s' if len(numbers) > 1 else ''} {number_ranges(numbers)}"

@@ -2,7 +2,7 @@
 
 Behind the tool and from the sides the truth is that of a phantom; from cameras beside the endoscope only tissue that
 it sees in the same frame counts (`phantom/views.py`). The right eye of a stereo endoscope has pictures of its own,
-which no method trains on; there only tissue that both eyes see counts, by measured depth (`footage/stereo_order.py`),
+which no method trains on; there only tissue that both cameras see counts, by measured depth (`data/right_camera.py`),
 and the left picture, moved to the right eye by that depth, is scored beside the scene.
 """
 
@@ -15,8 +15,8 @@ import numpy as np
 
 from ...core.geometry import expected_depth, right_camera
 from ...core.types import Frame
+from ...data.right_camera import measured_disparity, warp_to_right
 from ...footage.image_operations import Mask
-from ...footage.stereo_order import measured_disparity, warp_to_right
 from ..context import EvaluationContext
 from ..score import Score
 from .depth import depth_rmse

@@ -272,17 +272,17 @@ class Resected:
 
 
 def coarse_pose(
-    matrix: NDArray, points: NDArray, pixels: NDArray, guess: NDArray | None, inlier_px: float
+    matrix: NDArray, points: NDArray, pixels: NDArray, start: NDArray | None, inlier_px: float
 ) -> tuple[NDArray, NDArray] | None:
     """World-to-camera (4, 4) by perspective-n-point with RANSAC, and (N,) its inliers; None if there is none."""
     if len(points) < MIN_POINTS:
         return None
     turn = shift = None
-    if guess is not None:
-        turn, shift = cv2.Rodrigues(guess[:3, :3])[0], guess[:3, 3:].copy()
+    if start is not None:
+        turn, shift = cv2.Rodrigues(start[:3, :3])[0], start[:3, 3:].copy()
     cv2.setRNGSeed(0)
     done, turn, shift, found = cv2.solvePnPRansac(
-        points, pixels.astype(np.float64), matrix, None, turn, shift, guess is not None,
+        points, pixels.astype(np.float64), matrix, None, turn, shift, start is not None,
         iterationsCount=200, reprojectionError=inlier_px, confidence=0.999,
     )  # fmt: skip
     if not done or found is None or len(found) < MIN_POINTS or not np.isfinite(turn).all():

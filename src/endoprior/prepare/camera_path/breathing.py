@@ -67,7 +67,7 @@ def separate_breathing(follower: Follower, keyframes: list[int]) -> Breathing | 
 
     Poses of the frames that take part, points and weights of the follower change with it.
     """
-    tracks, lens = follower.tracks, follower.lens
+    tracks, camera = follower.tracks, follower.camera
     everything = np.arange(keyframes[0], keyframes[-1] + 1)
     found = _period(follower, everything[:: max(1, len(everything) // 300)])
     if found is None:
@@ -78,7 +78,7 @@ def separate_breathing(follower: Follower, keyframes: list[int]) -> Breathing | 
         return None
     ids, seen = tracks.of_frames(list(frames), follower.scales)
     poses, points, coefficients, weight = separate(
-        lens.matrix, follower.poses[frames], tracks.points[ids], seen, frames, found
+        camera.matrix, follower.poses[frames], tracks.points[ids], seen, frames, found
     )
     if not (np.isfinite(poses).all() and np.isfinite(points).all()):
         return None
@@ -100,9 +100,9 @@ def _period(follower: Follower, frames: NDArray) -> float | None:
         return None
     pose, here = follower.poses[frames][seen.camera[some]], tracks.points[ids][seen.point[some]]
     rest = seen.pixels[some], seen.inverse_depth[some], seen.sigma[some]
-    error = residuals(follower.lens.matrix, pose, here, *rest)
+    error = residuals(follower.camera.matrix, pose, here, *rest)
     weight, _ = weights(error, np.arange(len(some)), len(some))
-    by_point = derivatives(follower.lens.matrix, pose, here, seen.sigma[some])[1]
+    by_point = derivatives(follower.camera.matrix, pose, here, seen.sigma[some])[1]
     basis = surface_basis(tracks.points[ids])[seen.point[some]][:, :3]
     return breathing_period(error, by_point, weight, basis, frames[seen.camera[some]], int(np.ptp(frames)) + 1)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import tempfile
 import time as clock
-from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,7 +25,7 @@ from .features import usable_tissue
 from .follow import Follower
 from .own import finished_path, place_frames
 from .path import CameraPath
-from .tracks import PoseInput, Tracks
+from .tracks import FrameReader, PoseInput, TrackingCamera, Tracks
 
 ENOUGH_IMAGES, MAX_STRIDE = 150, 4  # a longer clip is mapped by every second to fourth frame
 LONGEST = 1000  # longer clips are mapped only if COLMAP is asked for: it takes seconds a frame
@@ -52,18 +51,16 @@ def is_installed() -> bool:
     return find_spec("pycolmap") is not None
 
 
-def colmap_path(
-    frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
-) -> CameraPath | None:
+def colmap_path(frames: FrameReader, follower: Follower) -> CameraPath | None:
     """The path by COLMAP, in the unit of our depth; None if no model holds enough frames.
 
     Args:
-        frame: reads frame i.
-        follower: our own tracks, their points adjusted: they show what deforms, and fill in frames.
-        refine_focal: the focal length is an assumption; the factor of the path is relative to that of `follower`.
+        follower: our own tracks, their points adjusted: they show what deforms, and fill in frames. The path's focal
+            factor is relative to their camera.
     """
     import pycolmap
 
+    count = frames.count
     stride = min(-(-count // ENOUGH_IMAGES), MAX_STRIDE)
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
@@ -71,10 +68,10 @@ def colmap_path(
         for part in ("images", "masks", "models"):
             (folder / part).mkdir()
         for i in range(0, count, stride):
-            seen = frame(i)
+            seen = frames.frame(i)
             save_png(folder / f"images/{i:06d}.png", seen.rgb_u8)
             save_png(folder / f"masks/{i:06d}.png.png", _allowed(seen, follower, i).astype(np.uint8) * 255)
-        models, notes = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
+        models, notes = _reconstruct(pycolmap, folder, follower.camera)
     best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if best is None or best.num_reg_images() < max(MIN_REGISTERED_SHARE * len(range(0, count, stride)), 3):
         return None
@@ -83,11 +80,11 @@ def colmap_path(
         if image.has_pose:
             index = int(Path(image.name).stem)
             poses[index, :3], known[index] = image.cam_from_world().matrix(), True
-    factor = float(next(iter(best.cameras.values())).params[0] / follower.lens.matrix[0, 0])
+    factor = float(next(iter(best.cameras.values())).params[0] / follower.camera.matrix[0, 0])
     unit = float(np.exp(np.median(np.log(with_poses(follower, poses, known, factor).scales[known]))))
     poses[:, :3, 3] /= unit
     world = with_poses(follower, poses, known, factor)
-    if not world.lens.depth_is_relative:
+    if not world.camera.depth_is_relative:
         world.scales[:] = 1.0
     explained = known | (follower.segment == follower.segment[np.argmax(known)])
     stds = place_frames(world, np.flatnonzero(known), follower.poses, explained)
@@ -96,8 +93,9 @@ def colmap_path(
     return replace(path, method=COLMAP_POSES, focal_factor=factor, notes=notes)
 
 
-def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: bool) -> tuple[dict[int, Any], list[str]]:
+def _reconstruct(pycolmap: Any, folder: Path, camera: TrackingCamera) -> tuple[dict[int, Any], list[str]]:
     """All models of the images in a folder, and notes; COLMAP counts the center of the left-most pixel as 0.5."""
+    matrix = camera.matrix
     database = folder / "database.db"
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model, reader.mask_path = "PINHOLE", folder / "masks"
@@ -106,7 +104,7 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     extraction.sift.max_num_features = 2000
     extraction.sift.peak_threshold = 0.003
     mapping = pycolmap.IncrementalPipelineOptions()
-    mapping.ba_refine_focal_length = mapping.mapper.abs_pose_refine_focal_length = refine_focal
+    mapping.ba_refine_focal_length = mapping.mapper.abs_pose_refine_focal_length = camera.focal_is_assumed
     mapping.random_seed = 0
     mapping.extract_colors = False
     mapping.mapper.init_min_tri_angle = 4.0
@@ -140,7 +138,7 @@ def with_poses(follower: Follower, poses: NDArray, known: NDArray[np.bool_], foc
     """
     out = copy.copy(follower)
     tracks = out.tracks = follower.tracks.copy()
-    tracks.lens = out.lens = follower.lens.with_focal(focal_factor)
+    tracks.camera = out.camera = follower.camera.with_focal(focal_factor)
     out.poses, out.scales = poses.copy(), np.ones(len(poses))
     position, spread = ray_points(tracks, poses, known)
     good = spread > PARALLAX
@@ -158,12 +156,12 @@ def with_poses(follower: Follower, poses: NDArray, known: NDArray[np.bool_], foc
     frames = [int(f) for n, f in enumerate(np.flatnonzero(known)) if n % STRIDE == 0 or f in keys]
     for f in reversed(frames):  # the first sight of a point stays
         ids, pixels, z = tracks.ids[f], tracks.pixels[f].astype(np.float64), tracks.depths[f] * out.scales[f]
-        tracks.points[ids] = back_projected(out.lens.matrix, poses[f], pixels, z)
+        tracks.points[ids] = back_projected(out.camera.matrix, poses[f], pixels, z)
     tracks.points[good] = position[good]
     ids, seen = tracks.of_frames(frames, out.scales)
     if len(ids):
         fixed = np.ones(len(frames), bool)
-        done = adjust(out.lens.matrix, poses[frames], tracks.points[ids], seen, fixed, rounds=4, steps=2)
+        done = adjust(out.camera.matrix, poses[frames], tracks.points[ids], seen, fixed, rounds=4, steps=2)
         tracks.points[ids], tracks.weight[ids], tracks.adjusted[ids] = done.points, done.track_weight, True
     return out
 
@@ -174,7 +172,7 @@ def ray_points(tracks: Tracks, poses: NDArray, known: NDArray[np.bool_]) -> tupl
     The point minimizes sum |(I - d d^T) (X - c)|^2 over rays with center c and direction d.
     """
     matrix, right, number = np.zeros((tracks.count, 9)), np.zeros((tracks.count, 3)), np.zeros(tracks.count)
-    inverse = np.linalg.inv(tracks.lens.matrix)
+    inverse = np.linalg.inv(tracks.camera.matrix)
     for f in np.flatnonzero(known):
         ids = tracks.ids[f]
         rays = np.concatenate([tracks.pixels[f], np.ones((len(ids), 1))], 1) @ inverse.T @ poses[f][:3, :3]

@@ -32,7 +32,7 @@ FINE_PX = 2.0  # the two results differ by less than this
 COARSE_FLAT_WIDTHS, BLUR_WIDTHS = 28, 160
 """Where corners are few, detail between blurs of width / 160 and width / 28 px is followed: finer patterns of sensor or
 fibers stay where they are while the view moves."""
-GUESS_PX = 10.0  # parallax: a corner is this far from where the image as a whole goes, px of an image 640 px wide
+EXPECTED_PX = 10.0  # parallax: a corner is this far from where the image as a whole goes, px of an image 640 px wide
 KEYPOINTS = 600
 RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
 MIN_POSE_INLIERS = 20  # fewer matches that one pose explains may be chance
@@ -134,7 +134,7 @@ def followed_directly(before: TrackingFrame, now: TrackingFrame, pixels: NDArray
     step = align(before.plain, now.plain, before.usable, now.usable)
     if step is None:
         return None
-    guess = (pixels @ step[:2, :2].T + step[:2, 2]).astype(np.float32)
+    expected = (pixels @ step[:2, :2].T + step[:2, 2]).astype(np.float32)
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
     there, good = track_points(
@@ -143,12 +143,12 @@ def followed_directly(before: TrackingFrame, now: TrackingFrame, pixels: NDArray
         pixels,
         side_px=31,
         halvings=FINE_HALVINGS,
-        guess=guess,
+        guess=expected,
         criteria=FINE_CRITERIA,
     )
     px = now.flat.shape[1] / 640
-    good &= ~fixed_in_image(there - pixels, guess - pixels, now.flat.shape[1])
-    good &= (np.linalg.norm(there - guess, axis=1) < GUESS_PX * px) & (sampled(now.usable, there) > 0)
+    good &= ~fixed_in_image(there - pixels, expected - pixels, now.flat.shape[1])
+    good &= (np.linalg.norm(there - expected, axis=1) < EXPECTED_PX * px) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
     return kept, there[kept]
 
@@ -194,14 +194,14 @@ def keyframe(index: int, view: TrackingFrame) -> Keyframe:
 
 
 def match_keyframe(
-    lens: TrackingCamera, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe
+    camera: TrackingCamera, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe
 ) -> KeyframeMatch | None:
     """Find the pose of `new` from what it shares with `old`; None if that is too little."""
     first, second = _matches(old.descriptors.astype(np.float32), new.descriptors.astype(np.float32))
     if len(first) < MIN_POSE_INLIERS:
         return None
-    points = back_projected(lens.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
-    found = coarse_pose(lens.matrix, points, new.pixels[second], None, INLIER_PX * lens.px)
+    points = back_projected(camera.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
+    found = coarse_pose(camera.matrix, points, new.pixels[second], None, INLIER_PX * camera.px)
     if found is None or found[1].sum() < max(MIN_POSE_INLIERS, 0.25 * len(first)):
         return None
     pose, inlier = found

@@ -26,7 +26,7 @@ from .features import (
     sampled,
     tracking_frame,
 )
-from .tracks import PoseInput, TrackingCamera, Tracks
+from .tracks import FrameReader, TrackingCamera, Tracks
 
 BYTES_PER_PX = 60  # memory in which a thread prepares a frame, bytes for each px of a square one
 MIN_TRACKS = 30  # with fewer tracks a frame gets no pose from the frame before
@@ -42,9 +42,9 @@ RECENT, OLDER = 6, 14  # keyframes that a lost frame is compared with: the last 
 class Follower:
     """What is known about the path so far."""
 
-    def __init__(self, lens: TrackingCamera, count: int, *, few_corners: bool = False) -> None:
-        """Args: lens: the camera. count: frames of the clip. few_corners: whether images are aligned directly first."""
-        self.few_corners, self.lens, self.tracks = few_corners, lens, Tracks(lens)
+    def __init__(self, camera: TrackingCamera, count: int, *, few_corners: bool = False) -> None:
+        """Args: count: frames of the sequence. few_corners: whether images are aligned directly first."""
+        self.few_corners, self.camera, self.tracks = few_corners, camera, Tracks(camera)
         self.poses = np.tile(np.eye(4), (count, 1, 1))  # (T, 4, 4) world-to-camera, in the world of the frame's segment
         self.scales = np.ones(count)
         self.segment = np.full(count, -1)
@@ -77,15 +77,15 @@ class Follower:
         self, index: int, last_view: TrackingFrame, ids: NDArray, before: NDArray, pixels: NDArray, depths: NDArray
     ) -> bool:
         """Set pose and scale of a frame from its tracks; False if nothing rigid explains them."""
-        tracks, lens = self.tracks, self.lens
+        tracks, camera = self.tracks, self.camera
         if len(ids) < MIN_TRACKS:
             return False
         used = ~tracks.held_out(ids)
         trusted = used & (tracks.weight[ids] > 0.1)
         used = trusted if trusted.sum() >= MIN_TRACKS else used
         ids, before, pixels, depths = ids[used], before[used], pixels[used], depths[used]
-        last, limit = self.poses[index - 1], INLIER_PX * lens.px
-        found = coarse_pose(lens.matrix, tracks.points[ids], pixels, last, limit)
+        last, limit = self.poses[index - 1], INLIER_PX * camera.px
+        found = coarse_pose(camera.matrix, tracks.points[ids], pixels, last, limit)
         if found is not None and found[1].mean() >= MIN_INLIERS:
             fine = tracks.refined(found[0], ids, tracks.points[ids], pixels, depths)
             pose, inlier = (fine.pose, fine.inlier) if fine.inlier.sum() >= 0.7 * found[1].sum() else found
@@ -93,8 +93,8 @@ class Follower:
             # Tissue that breathes leaves the place where it was first seen; from one frame to the next it moves little.
             z = sampled(last_view.depth, before) * self.scales[index - 1]
             there = z > 0
-            points = back_projected(lens.matrix, last, before[there].astype(np.float64), z[there])
-            found = coarse_pose(lens.matrix, points, pixels[there], last, limit)
+            points = back_projected(camera.matrix, last, before[there].astype(np.float64), z[there])
+            found = coarse_pose(camera.matrix, points, pixels[there], last, limit)
             if found is None or found[1].mean() < MIN_INLIERS:
                 return False
             pose, inlier = found[0], np.zeros(len(ids), bool)
@@ -112,7 +112,7 @@ class Follower:
 
     def _scale(self, pose: NDArray, ids: NDArray, depths: NDArray, otherwise: float) -> float:
         """Median ratio of the points' z to the measured depth; 1 where depth has a unit."""
-        if not self.lens.depth_is_relative:
+        if not self.camera.depth_is_relative:
             return 1.0
         z = self.tracks.points[ids] @ pose[2, :3] + pose[2, 3]
         good = (depths > 0) & (z > 0)
@@ -133,7 +133,7 @@ class Follower:
         if index - self.keyframes[-1].frame >= KEYFRAME_GAP or len(kept) < KEYFRAME_LEFT * len(ids):
             return True
         shift = np.hypot(*(self._pixels[now] - pixels[then]).T)
-        return bool(np.median(shift) > KEYFRAME_SHIFT * 640 * self.lens.px)
+        return bool(np.median(shift) > KEYFRAME_SHIFT * 640 * self.camera.px)
 
     def _add_keyframe(self, index: int) -> None:
         """Describe the frame in `self._view`, link its segment if it stands alone, adjust the last keyframes."""
@@ -143,7 +143,7 @@ class Follower:
         self.keyframes.append(new)
         tried = [*others[-RECENT:], *(others[i] for i in evenly_spaced(max(len(others) - RECENT, 0), OLDER))]
         links = [
-            (match_keyframe(self.lens, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried
+            (match_keyframe(self.camera, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried
         ]
         if found := [(each, old) for each, old in links if each is not None]:
             best, old = max(found, key=lambda pair: len(pair[0].old))
@@ -153,7 +153,7 @@ class Follower:
     def _move_segment(self, index: int, found: KeyframeMatch, target: int) -> None:
         """Move the segment of a frame into the world in which the frame has the pose of the match."""
         frames = np.flatnonzero(self.segment == self.segment[index])
-        factor = found.scale / self.scales[index] if self.lens.depth_is_relative else 1.0
+        factor = found.scale / self.scales[index] if self.camera.depth_is_relative else 1.0
         back, old = np.linalg.inv(found.pose), self.poses[index].copy()
         ids = np.unique(np.concatenate([self.tracks.ids[f] for f in frames if f < len(self.tracks.ids)] or [self._ids]))
         points = (self.tracks.points[ids] @ old[:3, :3].T + old[:3, 3]) * factor
@@ -176,7 +176,7 @@ class Follower:
         if len(ids) < MIN_TRACKS:
             return
         fixed = np.arange(len(frames)) < (2 if len(frames) > 3 else 1)
-        done = adjust(self.lens.matrix, self.poses[frames], tracks.points[ids], seen, fixed, rounds=2, steps=1)
+        done = adjust(self.camera.matrix, self.poses[frames], tracks.points[ids], seen, fixed, rounds=2, steps=1)
         if not np.isfinite(done.poses).all():
             return
         self.poses[frames], tracks.points[ids], tracks.weight[ids] = done.poses, done.points, done.track_weight
@@ -188,20 +188,27 @@ class Follower:
         pixels = new_corners(view, self._pixels)
         depths = sampled(view.depth, pixels).astype(np.float32)
         z = depths.astype(np.float64) * self.scales[index]
-        points = back_projected(self.lens.matrix, self.poses[index], pixels.astype(np.float64), z)
+        points = back_projected(self.camera.matrix, self.poses[index], pixels.astype(np.float64), z)
         ids = self.tracks.add_points(points, keypoint=False)
         self.tracks.see(index, ids, pixels, depths)
         self._ids, self._pixels = np.concatenate([self._ids, ids]), np.concatenate([self._pixels, pixels])
 
 
 def follow_camera(
-    frame: Callable[[int], PoseInput], count: int, lens: TrackingCamera,
-    progress: Callable[[int], None] = lambda _done: None, *, few_corners: bool = False,
-) -> Follower:  # fmt: skip
-    """Follow the camera through frames 0..count-1, each read once, in order."""
-    follower = Follower(lens, count, few_corners=few_corners)
-    with frame_threads(BYTES_PER_PX * lens.width**2) as pool:
-        for index, view in enumerate(pool.map(lambda i: tracking_frame(frame(i), coarse=few_corners), range(count))):
-            follower.follow(index, view)
+    frames: FrameReader,
+    camera: TrackingCamera,
+    progress: Callable[[int], None] = lambda _done: None,
+    *,
+    few_corners: bool = False,
+) -> Follower:
+    """Follow the camera through all frames, each read once, in order."""
+    follower = Follower(camera, frames.count, few_corners=few_corners)
+
+    def view(index: int) -> TrackingFrame:
+        return tracking_frame(frames.frame(index), coarse=few_corners)
+
+    with frame_threads(BYTES_PER_PX * camera.size[0] ** 2) as pool:
+        for index, seen in enumerate(pool.map(view, range(frames.count))):
+            follower.follow(index, seen)
             progress(index + 1)
     return follower

@@ -18,7 +18,7 @@ from .breathing import Breathing, separate_breathing
 from .features import Keyframe, match_keyframe
 from .follow import Follower, follow_camera
 from .path import CameraPath
-from .tracks import PoseInput, TrackingCamera, Tracks
+from .tracks import FrameReader, TrackingCamera, Tracks
 
 FOCAL_PRIOR = 0.2  # standard deviation of log f where the focal length is assumed
 FOCAL_STD = 0.03  # a refined focal length is kept if the standard deviation of its logarithm is below this
@@ -36,26 +36,23 @@ MIN_TRACKS = 20
 
 
 def own_path(
-    frame: Callable[[int], PoseInput],
-    count: int,
-    lens: TrackingCamera,
-    size: tuple[int, int],
-    *,
-    refine_focal: bool = False,
-    few_corners: bool = False,
+    frames: FrameReader,
+    camera: TrackingCamera,
     progress: Callable[[int], None] = lambda _done: None,
+    *,
+    few_corners: bool = False,
 ) -> tuple[CameraPath, Follower]:
-    """The path, and the tracks it comes from. Each frame is read once, in order. Args: as `choose.find_path`."""
-    follower = follow_camera(frame, count, lens, progress, few_corners=few_corners)
-    labels, frames = np.unique(follower.segment, return_counts=True)
-    explained = follower.segment == labels[np.argmax(frames)]
+    """The path, and the tracks it comes from. Each frame is read once, in order. Args: as `find_path`."""
+    follower = follow_camera(frames, camera, progress, few_corners=few_corners)
+    labels, counts = np.unique(follower.segment, return_counts=True)
+    explained = follower.segment == labels[np.argmax(counts)]
     keyframes = sorted((k for k in follower.keyframes if explained[k.frame]), key=lambda k: k.frame)
     followed_poses, focal_factor = follower.poses.copy(), 1.0
     if len(keyframes) > 1:
-        close_loops(follower, keyframes, size)
-        focal_factor = _adjust_all(follower, keyframes, refine_focal)
+        close_loops(follower, keyframes)
+        focal_factor = _adjust_all(follower, keyframes)
     starts, breathing = np.array([k.frame for k in keyframes], int), None
-    if not lens.depth_is_relative and len(keyframes) > 1 and explained[starts[0] : starts[-1] + 1].all():
+    if not camera.depth_is_relative and len(keyframes) > 1 and explained[starts[0] : starts[-1] + 1].all():
         place_frames(follower, starts, followed_poses, explained)
         breathing = separate_breathing(follower, starts.tolist())
     stds = place_frames(follower, starts, followed_poses, explained, breathing)
@@ -64,17 +61,17 @@ def own_path(
     return replace(path, focal_factor=focal_factor, breathes=breathing is not None, notes=notes), follower
 
 
-def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: bool) -> float:
+def _adjust_all(follower: Follower, keyframes: list[Keyframe]) -> float:
     """Adjust all keyframes at once; returns the refined focal length as a multiple of the given one."""
     tracks, frames = follower.tracks, [k.frame for k in keyframes]
-    fixed, factor = np.arange(len(frames)) == 0, 1.0
+    fixed, factor, refine_focal = np.arange(len(frames)) == 0, 1.0, follower.camera.focal_is_assumed
     for turn in range(4 if refine_focal else 3):
         ids, seen = tracks.of_frames(frames, follower.scales)
         if not len(ids):
             return factor
         prior, (rounds, widest) = FOCAL_PRIOR if refine_focal and turn else 0.0, (3, 1.0) if turn else (5, 16.0)
         done = adjust(
-            follower.lens.matrix, follower.poses[frames], tracks.points[ids], seen, fixed,
+            follower.camera.matrix, follower.poses[frames], tracks.points[ids], seen, fixed,
             rounds=rounds, steps=2, focal_prior=prior, widest=widest,
         )  # fmt: skip
         if not np.isfinite(done.poses).all():
@@ -86,7 +83,7 @@ def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: boo
         tracks.adjusted[ids] = True
         if prior:
             factor *= done.focal_factor
-            follower.lens = tracks.lens = follower.lens.with_focal(done.focal_factor)
+            follower.camera = tracks.camera = follower.camera.with_focal(done.focal_factor)
         for f in frames:
             follower.set_scale(f, tracks.adjusted)
     return factor
@@ -136,7 +133,7 @@ def finished_path(
     # Frames before the first explained one have its pose, later ones that of the frame before.
     source = seen[np.maximum(np.searchsorted(seen, np.arange(count), "right") - 1, 0)]
     poses, scales = poses[source], scales[source]
-    factor = 1 / np.exp(np.median(np.log(scales))) if follower.lens.depth_is_relative else 1.0
+    factor = 1 / np.exp(np.median(np.log(scales))) if follower.camera.depth_is_relative else 1.0
     poses = np.linalg.inv(poses[0]) @ poses
     poses[:, :3, 3] *= factor
     if len(spans) == 1 and spans[0] == (0, count - 1):
@@ -145,16 +142,16 @@ def finished_path(
     return CameraPath(poses, explained, scales * factor, OWN_POSES, 1.0, *stds, still)
 
 
-def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, int]) -> None:
+def close_loops(follower: Follower, keyframes: list[Keyframe]) -> None:
     """Match keyframes of one world with older ones of the same place; matched keypoints become tracks."""
-    tracks, lens, poses, scales = follower.tracks, follower.lens, follower.poses, follower.scales
+    tracks, camera, poses, scales = follower.tracks, follower.camera, follower.poses, follower.scales
     points = [
-        back_projected(lens.matrix, poses[k.frame], k.pixels.astype(np.float64), k.depths * scales[k.frame])
+        back_projected(camera.matrix, poses[k.frame], k.pixels.astype(np.float64), k.depths * scales[k.frame])
         for k in keyframes
     ]
     ids = [tracks.ids[k.frame] for k in keyframes]
     for b, new in enumerate(keyframes):
-        overlap = np.array([_share_inside(lens.matrix, poses[new.frame], points[a], size) for a in range(b)])
+        overlap = np.array([_share_inside(camera, poses[new.frame], points[a]) for a in range(b)])
         partners: list[int] = []
         for a in np.argsort(-overlap, kind="stable"):
             if len(partners) == PARTNERS or overlap[a] < OVERLAP:
@@ -164,7 +161,7 @@ def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, 
                 partners.append(int(a))
         for a in partners:
             old = keyframes[a]
-            match = match_keyframe(lens, old, poses[old.frame], scales[old.frame], new)
+            match = match_keyframe(camera, old, poses[old.frame], scales[old.frame], new)
             if match is None:
                 continue
             fresh = old.track[match.old] < 0
@@ -175,8 +172,9 @@ def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, 
                 tracks.see(key.frame, key.track[which], key.pixels[which], key.depths[which])
 
 
-def _share_inside(matrix: NDArray, pose: NDArray, points: NDArray, size: tuple[int, int]) -> float:
+def _share_inside(camera: TrackingCamera, pose: NDArray, points: NDArray) -> float:
     """Share of points (N, 3) that lie in the image."""
+    matrix, size = camera.matrix, camera.size
     seen = points @ pose[:3, :3].T + pose[:3, 3]
     z = np.maximum(seen[:, 2], 1e-6)
     u, v = matrix[0, 0] * seen[:, 0] / z + matrix[0, 2], matrix[1, 1] * seen[:, 1] / z + matrix[1, 2]
@@ -191,11 +189,11 @@ def resting(tracks: Tracks, explained: NDArray[np.bool_]) -> list[tuple[int, int
         if not explained[first]:
             first += 1
             continue
-        last, limit = first, LOW_PX * tracks.lens.px
+        last, limit = first, LOW_PX * tracks.camera.px
         while last + 1 < count and explained[last + 1] and _shift(tracks, first, last + 1) < limit:
             last += 1
             if last - first + 1 >= MIN_REST_FRAMES:
-                limit = HIGH_PX * tracks.lens.px
+                limit = HIGH_PX * tracks.camera.px
         if last - first + 1 >= MIN_REST_FRAMES:
             spans.append((first, last))
             first = last

@@ -128,17 +128,18 @@ class CameraPath:
         }
 
 
-def path_motion(path: CameraPath, tracks: Tracks, lens: TrackingCamera, size: tuple[int, int]) -> PathMotion:
-    """Measure a path. Args: tracks: whose depths were used. lens: with the focal length of the path. size: px."""
-    count, poses = len(path.explained), np.linalg.inv(path.camera_to_world)
+def path_motion(path: CameraPath, tracks: Tracks, camera: TrackingCamera) -> PathMotion:
+    """Measure a path. Args: tracks: whose depths were used. camera: before any refinement of the focal length."""
+    camera = camera.with_focal(path.focal_factor)
+    count, poses, size = len(path.explained), np.linalg.inv(path.camera_to_world), camera.size
     depth = np.array([np.median(z[z > 0]) if (z > 0).any() else np.nan for z in tracks.depths]) * path.depth_scale
     x, y = np.meshgrid(np.array([1, 3, 5]) * size[0] / 6, np.array([1, 3, 5]) * size[1] / 6)
     grid = np.stack([x.ravel(), y.ravel()], 1)
 
     def shift(f: int, motion: NDArray) -> float:
-        points = back_projected(lens.matrix, np.eye(4), grid, np.full(len(grid), depth[f]))
+        points = back_projected(camera.matrix, np.eye(4), grid, np.full(len(grid), depth[f]))
         there = points @ motion[:3, :3].T + motion[:3, 3]
-        pixels = there @ lens.matrix.T
+        pixels = there @ camera.matrix.T
         return float(np.hypot(*(pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-3) - grid).T).mean())
 
     def between(f: int, gap: int) -> NDArray | None:
@@ -157,4 +158,4 @@ def path_motion(path: CameraPath, tracks: Tracks, lens: TrackingCamera, size: tu
     way = np.array(ways).reshape(-1, 3)
     along, length = np.abs(way[:, 2]).sum(), np.linalg.norm(way, axis=1).sum()
     axial, ahead = (float(part / max(of, 1e-9)) for part, of in ((along, length), (way[:, 2].sum(), along)))
-    return PathMotion(np.array(shifts), np.array(parts).reshape(-1, 3), axial, ahead, lens.px)
+    return PathMotion(np.array(shifts), np.array(parts).reshape(-1, 3), axial, ahead, camera.px)

@@ -139,7 +139,8 @@ def read_text_poses(
     reach = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max()
     if reach * unit_mm > FARTHEST_M * MM_PER_M:
         got = f"a path that reaches {reach * unit_mm / MM_PER_M:g} from its start"
-        raise input_error(path, f"positions in m, within {FARTHEST_M:g} m", got, "divide positions in mm by 1000.")
+        want, fix = f"positions in m, within {FARTHEST_M:g} m", "for positions in mm: `--poses-unit-mm 1`."
+        raise input_error(path, want, got, fix)
     return poses, rule
 
 

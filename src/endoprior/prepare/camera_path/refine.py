@@ -10,7 +10,7 @@ corners.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,7 +22,7 @@ from ...system.memory import BoundedCache, cache_bytes
 from ...system.parallel import frame_threads
 from .adjust import Adjusted, Observations, adjust, back_projected, residuals
 from .path import CameraPath
-from .tracks import PoseInput, TrackingCamera
+from .tracks import FrameReader, PoseInput, TrackingCamera
 from .views import HighPassImage, Warp, choose_partners, matrix_at, scaled_size
 
 MAX_WIDTH = 640  # frames are matched at this width at most, px
@@ -30,7 +30,7 @@ PIXEL_STD = 0.3  # of a match, px of an image 640 px wide
 DEPTH_STD = 0.2  # of the depth so far, as a share of it: it holds the scale of the path
 FOCAL_PRIOR, FOCAL_STD = 0.2, 0.03  # of log f where it is assumed; a refined one is kept if it is known this well
 MIN_OBSERVATIONS = 30  # observations of a camera; with fewer it moves along with the nearest one that has more
-SEEN_IN = 3  # frames that see a corner by which the fit is judged
+SEEN_IN = 3  # frames that see a corner by which the fit is measured
 FITS_PX = 0.5  # three quarters of the matches of a rigid scene are within this, px of an image 640 px wide
 RIGID = 0.5  # weight of a corner that follows the rigid scene
 CORNERS, MIN_IN_FRAME, MAX_IN_FRAME = 6000, 30, 150  # of all frames; at least and at most of one
@@ -56,40 +56,33 @@ class Refined:
         return self.residual_px < FITS_PX
 
 
-def refined_path(
-    path: CameraPath,
-    frame: Callable[[int], PoseInput],
-    lens: TrackingCamera,
-    size: tuple[int, int],
-    *,
-    refine_focal: bool,
-) -> Refined | None:
+def refined_path(path: CameraPath, frames: FrameReader, camera: TrackingCamera) -> Refined | None:
     """Adjust a path to direct matches; None where too few frames have parallax.
 
     Args:
-        frame: reads frame i, with its depth in the unit of the path.
-        lens: with the focal length of the path. size: (width, height), px.
-        refine_focal: the focal length is an assumption.
+        frames: with depth in the unit of the path.
+        camera: before any refinement of the focal length.
     """
-    small = scaled_size(size, MAX_WIDTH)
-    matrix, px = matrix_at(lens.matrix, size, small), small[0] / 640
+    small = scaled_size(camera.size, MAX_WIDTH)
+    matrix = matrix_at(camera.with_focal(path.focal_factor).matrix, camera.size, small)
+    px, focal_prior = small[0] / 640, FOCAL_PRIOR if camera.focal_is_assumed else 0.0
     poses = np.linalg.inv(path.camera_to_world)
     # Frames of one pose, in which the camera rests, are one camera.
-    _, first, camera = np.unique(poses.reshape(len(poses), -1), axis=0, return_index=True, return_inverse=True)
-    camera, stations = camera.ravel(), poses[first]
-    matches = list(match_frames(frame, poses, path.explained, matrix, small))
-    seen, points, known = _observations(matches, poses, camera, matrix, px)
+    _, first, station = np.unique(poses.reshape(len(poses), -1), axis=0, return_index=True, return_inverse=True)
+    station, stations = station.ravel(), poses[first]
+    matches = list(match_frames(frames, poses, path.explained, matrix, small))
+    seen, points, known = _observations(matches, poses, station, matrix, px)
     if known.sum() < 2:
         return None
-    fixed = np.arange(len(stations)) == camera[np.flatnonzero(known[camera])[0]]
-    found = adjust(matrix, stations, points, seen, fixed, focal_prior=FOCAL_PRIOR if refine_focal else 0.0, steps=3)
+    fixed = np.arange(len(stations)) == station[np.flatnonzero(known[station])[0]]
+    found = adjust(matrix, stations, points, seen, fixed, focal_prior=focal_prior, steps=3)
     if found.focal_std > FOCAL_STD:  # the matches do not determine it
         found = adjust(matrix, stations, points, seen, fixed, steps=3)
     if not (np.isfinite(found.poses).all() and np.isfinite(found.points).all()):
         return None
-    new = _with_the_rest(stations, found.poses, known, first)[camera]
+    new = _with_the_rest(stations, found.poses, known, first)[station]
     new = new @ np.linalg.inv(new[0])  # the first frame is at the origin
-    scales = path.depth_scale * _scales(found, seen, len(stations))[camera]
+    scales = path.depth_scale * _scales(found, seen, len(stations))[station]
     focal = path.focal_factor * found.focal_factor
     done = replace(path, camera_to_world=np.linalg.inv(new), focal_factor=focal, depth_scale=scales)
     return Refined(done, PIXEL_STD * _residual(matrix, found, seen))
@@ -162,8 +155,8 @@ def _residual(matrix: NDArray, found: Adjusted, seen: Observations) -> float:
     adjusted[[0, 1], [0, 1]] *= found.focal_factor
     here = found.poses[seen.camera], found.points[seen.point], seen.pixels, seen.inverse_depth, seen.sigma
     error = np.linalg.norm(residuals(adjusted, *here)[:, :2], axis=1)
-    judged = np.bincount(seen.point)[seen.point] >= SEEN_IN
-    return float(np.quantile(error[judged], 0.75)) if judged.any() else np.inf
+    counted = np.bincount(seen.point)[seen.point] >= SEEN_IN
+    return float(np.quantile(error[counted], 0.75)) if counted.any() else np.inf
 
 
 @dataclass(frozen=True)
@@ -186,7 +179,7 @@ class _Picture:
 
 
 def match_frames(
-    frame: Callable[[int], PoseInput],
+    frames: FrameReader,
     world_to_camera: NDArray[np.float64],
     usable: NDArray[np.bool_],
     matrix: NDArray[np.float64],
@@ -195,7 +188,7 @@ def match_frames(
     """The matches of each frame, in order; None for a frame without partners.
 
     Args:
-        frame: reads frame i, with its depth in the unit of the path.
+        frames: with depth in the unit of the path.
         world_to_camera: (T, 4, 4). usable: (T,) whether a frame has a pose of its own.
         matrix: (3, 3) K at `size`, px; the left-most pixel is centered at 0. size: (w, h) at which to match, px.
     """
@@ -203,7 +196,7 @@ def match_frames(
     everything, count = range(len(usable)), int(np.clip(CORNERS / max(len(usable), 1), MIN_IN_FRAME, MAX_IN_FRAME))
 
     def picture(i: int) -> _Picture:
-        return pictures.get(i, lambda: _picture(frame(i), size))
+        return pictures.get(i, lambda: _picture(frames.frame(i), size))
 
     def distance(i: int) -> float:
         depth = picture(i).depth

@@ -5,7 +5,7 @@ It is estimated by our own tracks, or by COLMAP where that is installed and expl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ...core.checks import input_error, number_ranges
+from ...core.checks import frame_list, input_error
 from ...core.geometry import Convention, length_unit, to_ours
 from ...core.ranges import evenly_spaced
 from ...core.shell import install_command
@@ -31,7 +31,7 @@ from .path import CameraPath, path_motion
 from .pose_file import MM_PER_M, is_model, is_text, read_model_poses, read_poses, read_text_poses
 from .refine import refined_path
 from .shape import DepthShape, axial_cosine, fitted_shape, shape_by_light
-from .tracks import DEPTH_STD, PoseInput, TrackingCamera, Tracks
+from .tracks import DEPTH_STD, FrameReader, TrackingCamera, Tracks
 
 BYTES_PER_PX = 60  # memory in which a thread compares two frames, bytes for each px
 USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
@@ -52,7 +52,6 @@ UNKNOWN_POSES = "none: the motion of the camera is unknown"  # `sources.poses`
 STILL_EXPLAINED = 0.95  # share of the score of held-out tracks that a refined path keeps: tracks drift, it does not
 FIT = "path and lens are adjusted to direct matches of frames with parallax, which they fit"
 UNFIT = "direct matches of frames with parallax fit no camera"
-Frame = Callable[[int], PoseInput]
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Reading:
     """How the matrices of a file of poses are to be read."""
 
     convention: Convention = "opencv"
-    unit_mm: float = 1.0  # mm per unit of the positions
+    unit_mm: float | None = None  # mm per unit of the positions; None: as usual for files of the kind
     turn: NDArray | None = None  # (3, 3) rotation from the camera of the poses to that of the frames; None: the same
     sources: Sequence[int] | None = None  # place of each frame in the video, where a file has a row for each image
     image_times: Sequence[float] = ()  # of all images of the video, or else of the frames, s
@@ -77,7 +76,7 @@ class Reading:
 
     def ours(self, stored: NDArray) -> NDArray:
         """(T, 4, 4) camera-to-world of the frames, mm, OpenCV axes."""
-        poses = to_ours(stored, self.convention, self.unit_mm)
+        poses = to_ours(stored, self.convention, self.unit_mm or 1.0)
         if self.turn is not None:
             poses[:, :3, :3] = poses[:, :3, :3] @ self.turn.T
         return poses
@@ -88,14 +87,10 @@ AS_OURS = Reading()
 
 def sequence_path(
     how: str,
-    frame: Frame,
-    views: Callable[[], tuple[Iterable[NDArray[np.uint8]], Iterable[NDArray[np.bool_]]]],
-    count: int,
-    lens: TrackingCamera,
-    size: tuple[int, int],
+    frames: FrameReader,
+    camera: TrackingCamera,
     *,
-    has_depth: bool,
-    refine_focal: bool,
+    has_depth: bool = True,
     reading: Reading = AS_OURS,
     progress: Callable[[int], None] = lambda _done: None,
     facts: KnownFacts | None = None,
@@ -104,36 +99,33 @@ def sequence_path(
 
     Args:
         how: a name of `METHODS`, `still`, or a file of poses.
-        frame: reads frame i.
-        views: opens all images and all tissue masks, one after the other.
-        lens: its focal length may be an assumption: `refine_focal`.
-        size: (width, height), px.
+        has_depth: whether the frames have any.
         reading: how the matrices of a file are to be read, and what they belong to.
+        progress: is told the number of frames followed.
         facts: gets the motion of the image as a whole.
     Raises:
         InputError: the file of poses cannot be used, or COLMAP is asked for and not there.
     """
     if how not in (*METHODS, "still"):
-        return _given_path(how, frame, count, lens, has_depth, reading, progress)
+        return _given_path(how, frames, camera, has_depth, reading, progress)
     if (reading.convention, reading.unit_mm) != (AS_OURS.convention, AS_OURS.unit_mm):
         got, fix = f"--poses {how}", "Remove --poses-convention and --poses-unit-mm."
         raise input_error("--poses-convention", "a file with --poses", got, fix)
     if how == "still":
         return None, []
-    facts = facts or KnownFacts()
-    with frame_threads(BYTES_PER_PX * size[0] * size[1]) as pool:
-        motion = facts.camera_motion(lambda: views()[0], lambda: views()[1], pool.map)
+    facts, everything = facts or KnownFacts(), range(frames.count)
+    with frame_threads(BYTES_PER_PX * camera.size[0] * camera.size[1]) as pool:
+        motion = facts.camera_motion(
+            lambda: map(frames.color, everything), lambda: map(frames.tissue, everything), pool.map
+        )
     if how in ONLY_IF_MOVING and motion.kind == "static":
         return None, [motion.text]
     if not has_depth:
         return None, [f"{motion.text}; without depth its path cannot be estimated"]
-    path = find_path(
-        frame, count, lens, size, METHODS[how],
-        refine_focal=refine_focal, few_corners=motion.few_corners, progress=progress,
-    )  # fmt: skip
+    path = find_path(frames, camera, METHODS[how], few_corners=motion.few_corners, progress=progress)
     if how in ONLY_IF_MOVING and (why := _doubt(path, motion)):
         return _unknown_path(motion, why)
-    return path, [*_estimate_notes(motion.reason, path, lens), *path.notes]
+    return path, [*_estimate_notes(motion.reason, path, camera), *path.notes]
 
 
 def _doubt(path: CameraPath, motion: CameraMotion) -> str:
@@ -155,8 +147,8 @@ def _unknown_path(motion: CameraMotion, why: str) -> tuple[CameraPath, list[str]
         rests = np.zeros(count, bool)
     poses = np.tile(np.eye(4), (count, 1, 1))
     path = CameraPath(poses, rests, np.ones(count), UNKNOWN_POSES, is_unknown=True)
-    frames = number_ranges(np.flatnonzero(rests).tolist())
-    end = f"in frames {frames} the view rests, and one camera serves them" if rests.any() else "no model is possible"
+    frames = frame_list(np.flatnonzero(rests).tolist())
+    end = f"in {frames} the view rests, and one camera serves them" if rests.any() else "no model is possible"
     moved = "how the camera moves is unknown" if motion.moving else "the motion of the camera is unknown"
     return path, [
         f"{moved}: {motion.reason}; {why}. No poses are claimed: {end}. More frames per second, or another part of "
@@ -166,13 +158,13 @@ def _unknown_path(motion: CameraMotion, why: str) -> tuple[CameraPath, list[str]
 
 def _given_path(
     how: str,
-    frame: Frame,
-    count: int,
-    lens: TrackingCamera,
+    frames: FrameReader,
+    camera: TrackingCamera,
     has_depth: bool,
     reading: Reading,
     progress: Callable[[int], None],
 ) -> tuple[CameraPath, list[str]]:
+    count = frames.count
     known, notes = np.ones(count, bool), list(reading.notes)
     if is_model(Path(how)):
         if reading.convention != AS_OURS.convention:
@@ -182,40 +174,35 @@ def _given_path(
         stored, known, rule = read_model_poses(Path(how), sources, reading.image_names)
         notes.append(f"{how}: poses {rule}; their unit is that of --poses-unit-mm")
     elif is_text(Path(how)):
-        if reading.unit_mm == AS_OURS.unit_mm:
-            reading = replace(reading, unit_mm=MM_PER_M)  # what such files have
-        stored, rule = read_text_poses(Path(how), count, reading.sources, reading.image_times, reading.unit_mm)
-        notes.append(f"{how}: rows are matched {rule}; its unit is taken as {reading.unit_mm:g} mm")
+        unit_mm = reading.unit_mm or MM_PER_M
+        reading = replace(reading, unit_mm=unit_mm)
+        stored, rule = read_text_poses(Path(how), count, reading.sources, reading.image_times, unit_mm)
+        notes.append(f"{how}: rows are matched {rule}; its unit is taken as {unit_mm:g} mm")
     else:
         stored = read_poses(Path(how), count)
     path = CameraPath(reading.ours(stored), known, np.ones(count))
     if has_depth:
-        notes += _fit_notes(how, stored, frame, lens, reading)
-    if has_depth and lens.depth_is_relative:  # its scale is that at which its points agree with the poses
-        follower = follow_camera(frame, count, lens, progress)
+        notes += _fit_notes(how, stored, frames, camera, reading)
+    if has_depth and camera.depth_is_relative:  # its scale is that at which its points agree with the poses
+        follower = follow_camera(frames, camera, progress)
         world = with_poses(follower, np.linalg.inv(path.camera_to_world), known)
         path = replace(path, depth_scale=world.scales)
     return path, notes
 
 
 def find_path(
-    frame: Frame,
-    count: int,
-    lens: TrackingCamera,
-    size: tuple[int, int],
+    frames: FrameReader,
+    camera: TrackingCamera,
     how: How = "best",
     *,
-    refine_focal: bool = False,
     few_corners: bool = False,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> CameraPath:
     """Estimate the camera path.
 
     Args:
-        frame: reads frame i.
-        size: (width, height), px.
         how: `best` takes what explains the frames better.
-        refine_focal: the focal length is an assumption.
+        few_corners: the images show so few corners that they are aligned as a whole first.
         progress: is told the number of frames followed.
     Raises:
         InputError: `colmap` without its package, or without a result.
@@ -224,33 +211,29 @@ def find_path(
         raise input_error("--poses colmap", "the package pycolmap", "none", f"`{install_command('poses')}`.")
 
     def followed(shape: DepthShape | None = None) -> tuple[CameraPath, Follower]:
-        def shaped(index: int) -> PoseInput:
-            seen = frame(index)
-            return seen if shape is None else replace(seen, depth=shape.powered(seen.depth))
-
-        path, follower = own_path(
-            shaped, count, lens, size, refine_focal=refine_focal, few_corners=few_corners, progress=progress
-        )
-        motion = path_motion(path, follower.tracks, lens.with_focal(path.focal_factor), size)
-        return replace(path, motion=motion, shape=shape), follower
+        shaped = frames
+        if shape is not None:
+            shaped = replace(frames, depth=lambda i: shape.powered(frames.depth(i)))
+        path, follower = own_path(shaped, camera, progress, few_corners=few_corners)
+        return replace(path, motion=path_motion(path, follower.tracks, camera), shape=shape), follower
 
     own, follower = followed()
-    if lens.depth_is_relative and own.motion and how != "colmap" and own.motion.kind in DRIVES:
-        own, follower = _deeper(own, follower, followed, frame, axial_cosine(lens.with_focal(own.focal_factor), size))
-    if lens.depth_is_relative and how != "colmap":
-        own = _refined(own, follower.tracks, frame, lens, size, refine_focal=refine_focal)
+    if camera.depth_is_relative and own.motion and how != "colmap" and own.motion.kind in DRIVES:
+        own, follower = _deeper(own, follower, followed, frames, axial_cosine(camera.with_focal(own.focal_factor)))
+    if camera.depth_is_relative and how != "colmap":
+        own = _refined(own, follower.tracks, frames, camera)
     if how == "own" or not is_installed():
         return own
-    if how == "best" and (own.breathes or own.shape or count > LONGEST):  # COLMAP would give breathing to the camera
-        return own
-    other = colmap_path(frame, count, follower, refine_focal=refine_focal)
+    if how == "best" and (own.breathes or own.shape or frames.count > LONGEST):
+        return own  # COLMAP would give breathing to the camera
+    other = colmap_path(frames, follower)
     if other is None:
         if how == "colmap":
             raise input_error("--poses colmap", "images that COLMAP can register", "too few", "Use `--poses own`.")
         return replace(own, notes=[*own.notes, "COLMAP registers too few frames; the path is our own"])
     other = replace(other, focal_factor=own.focal_factor * other.focal_factor)
-    other = replace(other, motion=path_motion(other, follower.tracks, lens.with_focal(other.focal_factor), size))
-    mine, theirs = (explained_share(follower.tracks, lens, path) for path in (own, other))
+    other = replace(other, motion=path_motion(other, follower.tracks, camera))
+    mine, theirs = (explained_share(follower.tracks, camera, path) for path in (own, other))
     best = other if how == "colmap" or theirs > mine else own
     note = f"camera path by {best.method}: COLMAP explains {theirs:.1%} of the held-out tracks, our own path {mine:.1%}"
     return replace(best, notes=[*own.notes, note, *other.notes] if best is own else [*best.notes, note])
@@ -260,7 +243,7 @@ def _deeper(
     path: CameraPath,
     follower: Follower,
     followed: Callable[[DepthShape | None], tuple[CameraPath, Follower]],
-    frame: Frame,
+    frames: FrameReader,
     cosine: NDArray[np.float32],
 ) -> tuple[CameraPath, Follower]:
     """The path and its tracks with relative depth in the shape of triangulated points, else of the light in a tube; as
@@ -269,7 +252,7 @@ def _deeper(
     shape = fitted_shape(path.explained, follower, cosine) if path.motion and path.motion.drives else None
     if shape is None:
         posed = np.flatnonzero(path.explained)
-        shape = shape_by_light((frame(int(posed[i])) for i in evenly_spaced(len(posed), LIT_FRAMES)), cosine)
+        shape = shape_by_light((frames.frame(int(posed[i])) for i in evenly_spaced(len(posed), LIT_FRAMES)), cosine)
     if shape is None:
         return path, follower
     new, tracks = path, follower
@@ -281,30 +264,29 @@ def _deeper(
     return replace(new, shape=shape), tracks
 
 
-def _refined(
-    path: CameraPath, tracks: Tracks, frame: Frame, lens: TrackingCamera, size: tuple[int, int], *, refine_focal: bool
-) -> CameraPath:
+def _refined(path: CameraPath, tracks: Tracks, frames: FrameReader, camera: TrackingCamera) -> CameraPath:
     """The path adjusted to direct matches if they fit and still explain the held-out tracks; else as it is."""
 
-    def deep(index: int) -> PoseInput:
-        seen = frame(index)
-        depth = seen.depth if path.shape is None else path.shape.shaped(index, seen.depth)
-        return replace(seen, depth=(depth * path.depth_scale[index]).astype(np.float32))
+    def depth(index: int) -> NDArray[np.float32]:
+        """In the shape and the scale of the path."""
+        given = frames.depth(index)
+        shaped = given if path.shape is None else path.shape.shaped(index, given)
+        return (shaped * path.depth_scale[index]).astype(np.float32)
 
-    found = refined_path(path, deep, lens.with_focal(path.focal_factor), size, refine_focal=refine_focal)
+    found = refined_path(path, replace(frames, depth=depth), camera)
     if found is None:
         return path
     if not found.fits:
         note = f"{UNFIT} (residual {found.residual_px:.1f} px of 640): the tissue moves by itself"
         return replace(path, notes=[*path.notes, note])
-    if explained_share(tracks, lens, found.path) < STILL_EXPLAINED * explained_share(tracks, lens, path):
+    if explained_share(tracks, camera, found.path) < STILL_EXPLAINED * explained_share(tracks, camera, path):
         return path
-    motion = path_motion(found.path, tracks, lens.with_focal(found.path.focal_factor), size)
+    motion = path_motion(found.path, tracks, camera)
     note = f"{FIT} (residual {found.residual_px:.2f} px of 640)"
     return replace(found.path, motion=motion, notes=[*path.notes, note])
 
 
-def explained_share(tracks: Tracks, lens: TrackingCamera, path: CameraPath) -> float:
+def explained_share(tracks: Tracks, camera: TrackingCamera, path: CameraPath) -> float:
     """Mean over all frames of the mean score of their held-out observations, 0..1: tracks of no estimate.
 
     Each of these tracks is triangulated from every second of its observations, and compared with the others. A frame
@@ -312,9 +294,9 @@ def explained_share(tracks: Tracks, lens: TrackingCamera, path: CameraPath) -> f
 
     Args:
         tracks: their points are not used.
-        lens: before any refinement of the focal length.
+        camera: before any refinement of the focal length.
     """
-    lens, poses = lens.with_focal(path.focal_factor), np.linalg.inv(path.camera_to_world)
+    camera, poses = camera.with_focal(path.focal_factor), np.linalg.inv(path.camera_to_world)
     frame = np.repeat(np.arange(len(poses)), [len(each) for each in tracks.ids])
     ids = np.concatenate(tracks.ids)
     order = np.argsort(ids, kind="stable")  # by track, in time
@@ -325,18 +307,18 @@ def explained_share(tracks: Tracks, lens: TrackingCamera, path: CameraPath) -> f
     fitted = (turn % 2 == 0) & path.explained[frame]
     inverse = 1 / np.where(depths > 0, depths * path.depth_scale[frame], 1.0)
     number = np.bincount(ids[fitted], minlength=tracks.count)
-    std = DEPTH_STD[lens.depth_is_relative] * inverse * np.sqrt(np.maximum(number[ids], 1))
+    std = DEPTH_STD[camera.depth_is_relative] * inverse * np.sqrt(np.maximum(number[ids], 1))
     std = np.where(depths > 0, std, np.inf)
-    sigma = np.stack([np.full(len(ids), USUAL_PX * lens.px), std], 1)
+    sigma = np.stack([np.full(len(ids), USUAL_PX * camera.px), std], 1)
     points = np.zeros((tracks.count, 3))
     at = np.flatnonzero(fitted)[::-1]
     for f in np.unique(frame[at]):
         here = at[frame[at] == f]
-        points[ids[here]] = back_projected(lens.matrix, poses[f], pixels[here], 1 / inverse[here])
+        points[ids[here]] = back_projected(camera.matrix, poses[f], pixels[here], 1 / inverse[here])
     seen = Observations(frame[fitted], ids[fitted], pixels[fitted], inverse[fitted], sigma[fitted])
-    done = adjust(lens.matrix, poses, points, seen, np.ones(len(poses), bool), rounds=3, steps=3, widest=8.0)
+    done = adjust(camera.matrix, poses, points, seen, np.ones(len(poses), bool), rounds=3, steps=3, widest=8.0)
     tested = (turn % 2 == 1) & (number[ids] > 0)
-    error = residuals(lens.matrix, poses[frame], done.points[ids], pixels, inverse, sigma)
+    error = residuals(camera.matrix, poses[frame], done.points[ids], pixels, inverse, sigma)
     score = np.where(path.explained[frame], 1 / (1 + (error[:, :2] ** 2).sum(1)), 0.0)[tested]
     total = np.bincount(frame[tested], weights=score, minlength=len(poses))
     count = np.bincount(frame[tested], minlength=len(poses))
@@ -357,18 +339,19 @@ def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
     return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
 
-def _fit_notes(how: str, stored: NDArray, frame: Frame, lens: TrackingCamera, reading: Reading) -> list[str]:
+def _fit_notes(how: str, stored: NDArray, frames: FrameReader, camera: TrackingCamera, reading: Reading) -> list[str]:
     """A note if the images say that the poses are to be read in another way."""
 
     def view(index: int) -> RgbdFrame:
-        seen = frame(index)
-        return seen.rgb_u8, seen.tissue_mask, np.nan_to_num(seen.depth)
+        return frames.color(index), frames.tissue(index), np.nan_to_num(frames.depth(index))
 
     scaled, turn = stored.copy(), np.eye(3) if reading.turn is None else reading.turn
-    scaled[:, :3, 3] *= reading.unit_mm
-    fit = measure_poses(view, lens.matrix, scaled, reading.convention, turn=turn, relative=lens.depth_is_relative)
+    unit_mm = reading.unit_mm or 1.0
+    scaled[:, :3, 3] *= unit_mm
+    fit = measure_poses(view, camera.matrix, scaled, reading.convention, turn=turn, relative=camera.depth_is_relative)
     if fit is not None and fit.another_fits:
-        unit = f" --poses-unit-mm {fit.unit * reading.unit_mm:.4g}" if fit.unit * reading.unit_mm != 1 else ""
+        right = f"{fit.unit * unit_mm:.4g}"
+        unit = f" --poses-unit-mm {right}" if right != "1" or is_text(Path(how)) else ""
         words = f"the poses in {how} explain the images better in another way: {fit.reason}"
         return [f"{words}. If so: --poses-convention {fit.best}{unit}"]
     if fit is not None and fit.none_fits:
@@ -376,9 +359,9 @@ def _fit_notes(how: str, stored: NDArray, frame: Frame, lens: TrackingCamera, re
     return []
 
 
-def _estimate_notes(reason: str, path: CameraPath, lens: TrackingCamera) -> list[str]:
+def _estimate_notes(reason: str, path: CameraPath, camera: TrackingCamera) -> list[str]:
     """How far the path reaches and how sure it is, where the camera rests, and the focal length if it was refined."""
-    unit, centers = length_unit(lens.depth_is_relative), path.camera_to_world[:, :3, 3]
+    unit, centers = length_unit(camera.depth_is_relative), path.camera_to_world[:, :3, 3]
     reach = np.linalg.norm(centers - centers[0], axis=1).max()
     moves = "the camera hardly moves" if path.kind == "static" else "the camera moves"
     how = f"; by the path, its shift is {path.motion.reason}" if path.motion and len(path.motion.parts_px) else ""
@@ -391,8 +374,8 @@ def _estimate_notes(reason: str, path: CameraPath, lens: TrackingCamera) -> list
         stds = f"{moved:.2f} {unit}, {turned:.3f} degrees"
         notes.append(f"camera pose, standard deviation (median of the frames): {stds}")
     if path.still is not None and path.still.any():
-        notes.append(f"the camera rests in frames {number_ranges(np.flatnonzero(path.still).tolist())}")
+        notes.append(f"the camera rests in {frame_list(np.flatnonzero(path.still).tolist())}")
     if path.focal_factor != 1:
-        old = lens.matrix[0, 0]
+        old = camera.matrix[0, 0]
         notes.append(f"focal length refined with the path: {old * path.focal_factor:.0f} px in place of {old:.0f} px")
     return notes

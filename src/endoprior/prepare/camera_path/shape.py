@@ -91,10 +91,10 @@ class DepthShape:
         return np.asarray(powered * factor, np.float32)
 
 
-def axial_cosine(lens: TrackingCamera, size: tuple[int, int]) -> NDArray[np.float32]:
-    """(H, W) cosine of the angle between the rays of the pixels and the axis. Args: size: (W, H), px."""
-    x, y = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in size))
-    k = lens.matrix
+def axial_cosine(camera: TrackingCamera) -> NDArray[np.float32]:
+    """(H, W) cosine of the angle between the rays of the pixels and the axis."""
+    x, y = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in camera.size))
+    k = camera.matrix
     return np.asarray(1 / np.sqrt(1 + ((x - k[0, 2]) / k[0, 0]) ** 2 + ((y - k[1, 2]) / k[1, 1]) ** 2), np.float32)
 
 

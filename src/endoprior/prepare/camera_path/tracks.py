@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,22 +28,42 @@ class PoseInput:
 
 
 @dataclass(frozen=True)
+class FrameReader:
+    """Reads the frames of a sequence when they are needed."""
+
+    color: Callable[[int], NDArray[np.uint8]]  # (H, W, 3) of frame i
+    tissue: Callable[[int], NDArray[np.bool_]]  # (H, W) True outside tools
+    depth: Callable[[int], NDArray[np.float32]]  # (H, W) mm or relative, 0 where missing
+    count: int
+
+    def frame(self, index: int) -> PoseInput:
+        """A frame with all its parts."""
+        return PoseInput(self.color(index), self.tissue(index), self.depth(index))
+
+
+@dataclass(frozen=True)
 class TrackingCamera:
     """A pinhole camera whose depth was measured; pixel centers are counted from 0, as in OpenCV."""
 
     matrix: NDArray  # (3, 3) K, px
-    width: int  # of the image, px
+    size: tuple[int, int]  # (width, height) of the image, px
     depth_is_relative: bool  # each frame's depth has a scale of its own
     baseline_mm: float | None = None  # distance between the cameras that measured the depth, mm
+    focal_is_assumed: bool = False  # so that the path may refine it
 
     @classmethod
     def centered_at_half(
-        cls, matrix: NDArray, width: int, depth_is_relative: bool, baseline_mm: float | None = None
+        cls,
+        matrix: NDArray,
+        size: tuple[int, int],
+        depth_is_relative: bool,
+        baseline_mm: float | None = None,
+        focal_is_assumed: bool = False,
     ) -> TrackingCamera:
         """From K with the left-most pixel centered at 0.5."""
         opencv = np.array(matrix, np.float64)
         opencv[:2, 2] -= 0.5
-        return cls(opencv, width, depth_is_relative, baseline_mm)
+        return cls(opencv, size, depth_is_relative, baseline_mm, focal_is_assumed)
 
     def with_focal(self, factor: float) -> TrackingCamera:
         """The camera with both focal lengths multiplied."""
@@ -53,14 +74,14 @@ class TrackingCamera:
     @property
     def px(self) -> float:
         """Length of a pixel of an image 640 px wide, in px of this one: thresholds are multiples of it."""
-        return self.width / 640
+        return self.size[0] / 640
 
 
 class Tracks:
     """Observations by frame, and the points they belong to."""
 
-    def __init__(self, lens: TrackingCamera) -> None:
-        self.lens = lens
+    def __init__(self, camera: TrackingCamera) -> None:
+        self.camera = camera
         self.ids: list[NDArray[np.int32]] = []
         self.pixels: list[NDArray[np.float32]] = []
         self.depths: list[NDArray[np.float32]] = []
@@ -101,21 +122,21 @@ class Tracks:
 
     def measured(self, ids: NDArray, depths: NDArray) -> tuple[NDArray, NDArray]:
         """(N,) inverse depth, 1/mm, and (N, 2) standard deviations of pixel and inverse depth."""
-        lens, there = self.lens, depths > 0
+        camera, there = self.camera, depths > 0
         inverse = 1 / np.where(there, depths.astype(np.float64), 1.0)
-        if lens.baseline_mm and not lens.depth_is_relative:
-            std = np.full(len(ids), DISPARITY_STD / (lens.matrix[0, 0] * lens.baseline_mm))
+        if camera.baseline_mm and not camera.depth_is_relative:
+            std = np.full(len(ids), DISPARITY_STD / (camera.matrix[0, 0] * camera.baseline_mm))
         else:
-            std = DEPTH_STD[lens.depth_is_relative] * inverse
-        pixel = np.where(self.keypoint[ids], KEYPOINT_STD, PIXEL_STD) * lens.px
+            std = DEPTH_STD[camera.depth_is_relative] * inverse
+        pixel = np.where(self.keypoint[ids], KEYPOINT_STD, PIXEL_STD) * camera.px
         return inverse, np.stack([pixel, np.where(there, std, np.inf)], 1)
 
     def refined(self, start: NDArray, ids: NDArray, points: NDArray, pixels: NDArray, depths: NDArray) -> Resected:
         """The pose of a frame that sees these points (N, 3); relative depth has an unknown scale and does not count."""
         inverse, sigma = self.measured(ids, depths)
-        if self.lens.depth_is_relative:
+        if self.camera.depth_is_relative:
             sigma[:, 1] = np.inf
-        return refined_pose(self.lens.matrix, start, points, pixels, inverse, sigma, self.weight[ids])
+        return refined_pose(self.camera.matrix, start, points, pixels, inverse, sigma, self.weight[ids])
 
     def of_frames(self, frames: list[int], scales: NDArray) -> tuple[NDArray[np.int32], Observations]:
         """Points seen in two frames or more, and their observations. Args: scales: (T,) of the depth of all frames."""
@@ -127,7 +148,7 @@ class Tracks:
         keep = (number[ids] >= 2) & ~self.held_out(ids)
         ids, camera, pixels, depths, scale = ids[keep], camera[keep], pixels[keep], depths[keep], scale[keep]
         inverse, sigma = self.measured(ids, depths * scale.astype(np.float32))
-        if self.lens.depth_is_relative:
+        if self.camera.depth_is_relative:
             # The depth of one place is wrong in the same way in every frame: all of them count as one measurement.
             sigma[:, 1] *= np.sqrt(number[ids])
         points, point = np.unique(ids, return_inverse=True)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.footage.stereo_order import stereo_order, vertical_offset_px
+from endoprior.footage.stereo_matching import stereo_order, vertical_offset_px
 
 WIDTH, HEIGHT = 241, 179
 

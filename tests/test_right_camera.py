@@ -1,4 +1,4 @@
-"""The right eye: which folders have one, what both eyes see by depth, and how a scene is scored from there."""
+"""The right camera: which folders have one, what both cameras see by depth, and how a scene is scored from there."""
 
 import json
 from dataclasses import replace
@@ -16,9 +16,9 @@ from endoprior.core.config import DataConfig
 from endoprior.core.geometry import back_project, project, right_camera
 from endoprior.core.types import Camera, RenderedView
 from endoprior.data import load_sequence
+from endoprior.data.right_camera import NEAREST, measured_disparity, right_disparity, warp_to_right
 from endoprior.evaluation.context import NO_SCENE, Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.scorers import other_views
-from endoprior.footage.stereo_order import NEAREST, measured_disparity, right_disparity, warp_to_right
 from endoprior.phantom import PhantomConfig, write_phantom
 
 BASELINE = 4.0
