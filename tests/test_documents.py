@@ -14,12 +14,14 @@ from pkgutil import resolve_name
 from urllib.parse import unquote
 
 import pytest
+import shtab
 import yaml
 from command_modules import parsed
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
-from endoprior.cli import descriptions
+from endoprior.cli import REGISTRY, descriptions
+from endoprior.cli.completion import whole_parser
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})
@@ -29,6 +31,8 @@ CURRENT = [page for page in PAGES if page not in (COMMANDS_OF_THE_LOG, ROOT / "C
 ELSEWHERE = ("http://", "https://", "mailto:")
 TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 OWN_PATH = re.compile(r"(?<![\w/])(?:bench|docs|faults|src|tests)/[\w./*-]+")
+OPTIONS_OF_OTHERS = {"--areas-weight", "--extra-index-url", "--gpus", "--index-url", "--per_obj_png_file", "--run"}
+"""Of pip, Docker and SAM 2, of the example of a method, and of a script in bench/."""
 PLACEHOLDERS = {"COMMAND", "...", "NAME"}
 """Words that stand for a command, a choice or the rest of a line."""
 
@@ -87,6 +91,21 @@ def test_commands_parse(page):
                 parsed(name, *rest)
         except ValueError as error:
             pytest.fail(f"{page.name}: endoprior {name} {' '.join(rest)}: {error}")
+
+
+@cache
+def known_options() -> set[str]:
+    """Every long option of every command, and the short names of fields of the config."""
+    listed = re.findall(r"--[a-z][a-z0-9.-]*[a-z0-9]", shtab.complete(whole_parser(), "bash"))
+    return {*listed, *REGISTRY.load("train").short, *OPTIONS_OF_OTHERS}
+
+
+@pytest.mark.parametrize("page", CURRENT, ids=lambda page: page.name)
+def test_options_in_sentences_exist(page):
+    for token in tokens(page):
+        option = re.match(r"--[a-z][\w.-]*", token.content) if token.type == "code_inline" else None
+        if option and not option[0].endswith("."):
+            assert option[0] in known_options(), f"{page.name}: {option[0]}: no command has this option"
 
 
 @pytest.mark.parametrize("page", CURRENT, ids=lambda page: page.name)

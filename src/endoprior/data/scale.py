@@ -27,7 +27,7 @@ EXAMPLE = f"`{OPTION} 12,310,205,402,198,20`."
 WINDOW_PX = 2  # depth at a point is the median of the tissue within so many px
 CLICK_PX = 1.5  # standard deviation of a point's place
 SHAPE_STD = 0.12
-"""Standard deviation of the log of a long length in relative depth of the right scale (docs/prepare.md)."""
+"""Standard deviation of the log of a long length in relative depth of the right scale (docs/depth_and_poses.md)."""
 RELIEF_STD = 0.08
 """Relief that relative depth misses between two points: standard deviation of its ratio to their distance."""
 PRIOR_WEIGHT = 2.0  # lengths that `SHAPE_STD` counts as, beside the spread of those that are given

@@ -116,8 +116,8 @@ class PrepareConfig:
 
     poses: str = "auto"
     """`still` (static camera), `estimate` (from depth and static tissue; by COLMAP if it is installed and explains the
-    frames better; `own` and `colmap` force one), or a file of poses (docs/prepare.md). `auto` estimates poses if the
-    camera moves; `auto-own` never by COLMAP, which takes longer."""
+    frames better; `own` and `colmap` force one), or a file of poses (docs/depth_and_poses.md). `auto` estimates poses
+    if the camera moves; `auto-own` never by COLMAP, which takes longer."""
     poses_convention: Convention = "opencv"
     """Meaning of the matrices in the file of --poses: camera-to-world with OpenCV or OpenGL axes, or LLFF's columns
     (down, right, back); or world-to-camera. `check` tells which one fits."""

@@ -96,7 +96,7 @@ FAR_OFF = 0.05  # share of readings that are wrong: another edge, no shaft
 WIDE = 4.0  # range of log s in which those are
 GAPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)  # means of g that are tried
 SHAPE_STD = 0.06
-"""Standard deviation of log relative depth against that of other places: 0.04 to 0.07 for shading (docs/prepare.md)."""
+"""Standard deviation of log relative depth against that of other places: 0.04 to 0.07 for shading."""
 COMMON_STD = 0.12
 """Standard deviation of what all readings share: a wrist always bent to one side, shadows beside the shaft."""
 STEPS = 2000
