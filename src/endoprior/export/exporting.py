@@ -56,7 +56,7 @@ def export(
         >>> [file.name for file in files]
         ['tissue.ply']
     """
-    scene = with_gaussians(scene).to("cpu")  # where formats read its numbers
+    scene = with_gaussians(scene.to("cpu"))  # where formats read its numbers
     out, options = Path(out), options or ExportOptions()
     name = format_name(out, options)
     chosen = load_format(name)
