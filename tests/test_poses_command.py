@@ -154,7 +154,7 @@ def test_bad_input_gives_one_line_and_changes_nothing(folder, tmp_path, kind, ca
         np.save(tmp_path / "few.npy", TRUE[:3])
         options = ["--poses", str(tmp_path / "few.npy")]
     else:
-        monkeypatch.setattr("endoprior.data.writer.os.access", lambda *args: False)
+        monkeypatch.setattr("endoprior.data.edit.os.access", lambda *args: False)
     before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     assert main(["poses", str(folder), *options]) == 2
     said = capsys.readouterr().err.strip().splitlines()

@@ -13,7 +13,7 @@ from view_client import Client, at_work, wait_until
 
 from endoprior.cli.view import open_viewable
 from endoprior.core.checks import InputError
-from endoprior.data import load_sequence, writer
+from endoprior.data import edit, load_sequence
 from endoprior.tool_masks.clicked_tools import SearchStep, ToolClick, check_clicks
 from endoprior.view import layers
 from endoprior.view.incoming import JobQueue
@@ -118,7 +118,7 @@ def test_saving_keeps_the_first_original_and_notes_what_changed(tiny_sequence, t
 def test_a_read_only_folder_is_one_clear_line(edits, monkeypatch, tiny_sequence):
     edits.begin()
     edits.draw(0, [(10, 10)], 3, True)
-    monkeypatch.setattr(writer.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(edit.os, "access", lambda path, mode: False)
     with pytest.raises(InputError, match=r"read-only one\. Fix: Copy the data folder") as error:
         edits.save()
     assert "\n" not in str(error.value) and not (tiny_sequence / "masks_before").exists()
