@@ -240,7 +240,7 @@ def test_folders_that_are_in_mm_or_without_tools(folder, capsys):
     changed = described(folder) | {"depth_relative": False}
     (folder / "sequence.json").write_text(json.dumps(changed))
     assert main(["scale", str(folder), "--known-length", LENGTH]) == 2
-    assert "expected relative depth, of a video with one eye, got depth in mm" in capsys.readouterr().err
+    assert "expected relative depth, of a video of one camera, got depth in mm" in capsys.readouterr().err
     assert main(["scale", str(folder / "none"), "--known-length", LENGTH]) == 2
     assert "none" in capsys.readouterr().err
 

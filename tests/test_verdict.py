@@ -141,7 +141,7 @@ def test_rays_of_a_resting_camera_and_rays_that_miss_tell_no_depth():
         ({"slip_px": 22.0}, VerdictFacts(), "doubtful", "slips by 22.0 px"),
         ({"depth_triangulated_error": 0.05}, VerdictFacts(depth_is_guessed=True), "good", "5% off"),
         ({"depth_triangulated_error": 0.5}, VerdictFacts(), "doubtful", "50% off"),
-        ({}, VerdictFacts(depth_is_guessed=True), "usable", "a guess from one eye"),
+        ({}, VerdictFacts(depth_is_guessed=True), "usable", "a guess from one camera"),
         (
             {"depth_triangulated_error": 0.05},
             VerdictFacts(depth_measured=0.27),

@@ -45,7 +45,10 @@ def radiance_of(cfg: Config) -> RadianceConfig:
 
 
 def endonerf() -> Config:
-    """EndoNeRF, sized: 2,000 iterations of 512 rays. Without its depth refinement, which renders every frame."""
+    """EndoNeRF, a radiance field: slow on a CPU.
+
+    2,000 iterations of 512 rays, without its depth refinement, which renders every frame.
+    """
     return _config("endonerf", SIZED_ITERATIONS, RadianceConfig())
 
 
@@ -55,7 +58,10 @@ def endonerf_published() -> Config:
 
 
 def endosurf() -> Config:
-    """EndoSurf, sized: 2,000 iterations of 512 rays; warm-up and annealing are the published shares of them."""
+    """EndoSurf, a radiance field with a surface: slow on a CPU.
+
+    2,000 iterations of 512 rays; warm-up and annealing are the published shares of them.
+    """
     return _config("endosurf", SIZED_ITERATIONS, RadianceConfig())
 
 

@@ -89,7 +89,7 @@ def demand_relative(folder: Path, described: dict[str, Any]) -> None:
     """Raise InputError unless the depth of a folder is relative, or was before it got a scale."""
     if not described.get("depth_relative", False) and described_scale(folder, described) is None:
         fix = "leave the folder as it is: its lengths are in mm already."
-        raise input_error(folder, "relative depth, of a video with one eye", "depth in mm", fix)
+        raise input_error(folder, "relative depth, of a video of one camera", "depth in mm", fix)
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,7 @@ class FrameSequence:
 
     @property
     def depth_is_guessed(self) -> bool:
-        """Whether depth is a guess from one eye, in a unit or not: its shape was not measured."""
+        """Whether depth is a guess from one camera, in a unit or not: its shape was not measured."""
         return self.depth_is_relative or self.scale is not None
 
     @property

@@ -51,7 +51,7 @@ class VerdictFacts:
     lengths_are_relative: bool = False
     """Their unit is unknown: they are not mm."""
     depth_is_guessed: bool = False
-    """Depth is guessed from one eye."""
+    """Depth is guessed from one camera."""
     depth_measured: float | None = None
     """Share of the tissue whose depth the motion of the camera measured, 0..1; None where nothing was measured so."""
     motion_is_unknown: bool = False
@@ -141,7 +141,7 @@ def _depth(scores: Mapping[str, float], facts: VerdictFacts) -> Iterator[tuple[i
     if share is not None and share < MEASURED:
         yield USABLE, f"depth is measured by parallax on {share:.0%} of the tissue, and a guess beside it"
     elif share is None and error is None and facts.depth_is_guessed:
-        yield USABLE, "depth is a guess from one eye that nothing confirms: do not trust views from the side"
+        yield USABLE, "depth is a guess from one camera that nothing confirms: do not trust views from the side"
 
 
 def _frames(facts: VerdictFacts) -> Iterator[tuple[int, str]]:

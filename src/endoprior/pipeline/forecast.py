@@ -64,7 +64,7 @@ def parts_of(job: SequenceJob, waiting: Sequence[str]) -> list[Part]:
 
 def _may_measure_by_motion(job: SequenceJob) -> bool:
     """Whether `prepare` measures depth by the motion of the camera if that moves: a video without a calibration mostly
-    has one eye."""
+    has one camera."""
     if not isinstance(job, Job):
         return False
     return job.prepare.demands_motion or (job.prepare.depth == "auto" and job.prepare.calibration is None)

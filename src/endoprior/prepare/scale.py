@@ -103,7 +103,7 @@ def demand_no_unit(known_length: Sequence[str], shaft_mm: float, relative: bool)
     """Raise InputError if a scale is given for depth that is in mm already."""
     if (known_length or shaft_mm) and not relative:
         option = "--known-length" if known_length else SHAFT_OPTION
-        raise input_error(option, "relative depth, of a video with one eye", "depth in mm", f"remove {option}.")
+        raise input_error(option, "relative depth, of a video of one camera", "depth in mm", f"remove {option}.")
 
 
 def use_scale(
