@@ -1,1 +1,1 @@
-"""What every other package uses: data types, configuration, presets, checks of arrays, camera geometry."""
+"""What every other package uses: data types, configuration, checks, geometry."""

@@ -1,9 +1,9 @@
-"""What no training frame shows at that time: tissue behind the tool, from cameras beside, and from the right eye.
+"""What no training frame shows at that time: tissue behind the tool, from cameras beside, and from the right camera.
 
 Behind the tool and from the sides the truth is that of a phantom; from cameras beside the endoscope only tissue that
-it sees in the same frame counts (`phantom/views.py`). The right eye of a stereo endoscope has pictures of its own,
-which no method trains on; there only tissue that both cameras see counts, by measured depth (`data/right_camera.py`),
-and the left picture, moved to the right eye by that depth, is scored beside the scene.
+it sees in the same frame counts (`phantom/views.py`). The right camera of a stereo endoscope has images of its own,
+which only `--eyes both` trains on; there only tissue that both cameras see counts, by measured depth
+(`data/right_camera.py`), and the left image, moved to the right camera by that depth, is scored beside the scene.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ OF_SIDES = (
     ),
     Score(
         "side_lpips", "side LPIPS", "", False, 4,
-        "LPIPS by SqueezeNet of these pictures, where its weights are on this machine.",
+        "LPIPS by SqueezeNet of these images, where its weights are on this machine.",
         group="image", in_summary=False,
     ),
     Score(
@@ -77,25 +77,25 @@ OF_SIDES = (
 )  # fmt: skip
 OF_RIGHT_EYE = (
     Score(
-        "right_psnr", "right eye PSNR", "dB", True, 2,
-        "PSNR of tissue seen by both eyes, from the right one, not trained on but with --eyes both; stereo only.",
+        "right_psnr", "right camera PSNR", "dB", True, 2,
+        "PSNR of tissue that both cameras see, from the right one, not trained on but with --eyes both; stereo only.",
         compare="absolute", group="image", hint="a view never trained on",
     ),
     Score(
-        "right_lpips", "right eye LPIPS", "", False, 4,
-        "LPIPS by SqueezeNet of these pictures, where its weights are on this machine.",
+        "right_lpips", "right camera LPIPS", "", False, 4,
+        "LPIPS by SqueezeNet of these images, where its weights are on this machine.",
         group="image", in_summary=False,
     ),
     Score(
-        "right_psnr_warp", "right eye PSNR, warp", "dB", True, 2,
-        "PSNR of these pixels in the left picture, moved to the right eye by measured depth; no scene is needed.",
+        "right_psnr_warp", "right camera PSNR, warp", "dB", True, 2,
+        "PSNR of these pixels in the left image, moved to the right camera by measured depth; no scene is needed.",
         compare="absolute", group="image", in_summary=False,
     ),
 )  # fmt: skip
 SCORES = (*OF_HIDDEN, *OF_SIDES, *OF_RIGHT_EYE)
 NO_SEEN = "not known where tissue behind the tool is seen at another time"
 NO_SIDE = "no side camera sees tissue that the endoscope sees, or these frames have no side views"
-NO_RIGHT = "no tissue with measured depth that both eyes see"
+NO_RIGHT = "no tissue with measured depth that both cameras see"
 
 
 def compute(context: EvaluationContext) -> None:
@@ -168,7 +168,7 @@ def score_sides(context: EvaluationContext) -> None:
 
 
 def score_right_eye(context: EvaluationContext) -> None:
-    """Score the view of the right eye; nothing without one."""
+    """Score what the right camera sees; nothing without one."""
     if (eye := context.sequence.right_eye) is None:
         return
     scene = None
