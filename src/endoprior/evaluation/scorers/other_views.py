@@ -1,9 +1,9 @@
-"""What no training frame shows at that time: tissue behind the tool, from cameras beside, and from the right eye.
+"""What no training frame shows at that time: tissue behind the tool, from cameras beside, and from the right camera.
 
 Behind the tool and from the sides the truth is that of a phantom; from cameras beside the endoscope only tissue that
-it sees in the same frame counts (`phantom/views.py`). The right eye of a stereo endoscope has pictures of its own,
-which no method trains on; there only tissue that both cameras see counts, by measured depth (`data/right_camera.py`),
-and the left picture, moved to the right eye by that depth, is scored beside the scene.
+it sees in the same frame counts (`phantom/views.py`). The right camera of a stereo endoscope has images of its own,
+which are trained on with `data.eyes` both alone; there only tissue that both cameras see counts, by measured depth
+(`data/right_camera.py`), and the left image, moved to the right camera by that depth, is scored beside the scene.
 """
 
 from __future__ import annotations
