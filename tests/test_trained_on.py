@@ -26,6 +26,16 @@ def run(tiny_sequence, tmp_path) -> Path:
     return tmp_path / "run"
 
 
+def test_the_first_file_that_is_missing_is_named(tiny_sequence):
+    sequence = load_sequence(tiny_sequence)
+    first = min(sequence.files)
+    for file in sequence.files:
+        file.unlink()
+    with pytest.raises(InputError) as error:
+        sequence.fingerprints()
+    assert str(error.value).startswith(f"{first}: ")
+
+
 def brighter(folder: Path) -> None:
     edit(folder, lambda image, _position: image // 2 + 60)
 

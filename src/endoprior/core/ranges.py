@@ -16,7 +16,6 @@ Range = namedtuple("Range", "low high")
 Count = Annotated[int, Range(0, 10_000_000)]
 Positive = Annotated[int, Range(1, 10_000_000)]
 Share = Annotated[float, Range(0, 1)]
-Percent = Annotated[float, Range(0, 100)]
 Weight = Annotated[float, Range(0, 1e6)]
 Threshold = Annotated[float, Range(-1e3, 1e3)]
 Rate = Annotated[float, Range(0, 1e3)]

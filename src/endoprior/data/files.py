@@ -234,9 +234,9 @@ def demand_same(files: Sequence[Path], states: Sequence[FileState], before: Sequ
 
 
 def digests_of(files: Iterable[Path]) -> dict[Path, bytes]:
-    """SHA-256 of the contents of each file."""
+    """SHA-256 of the contents of each file; each is read once, in order."""
     digests = dict[Path, bytes]()
-    for file in files:
+    for file in sorted({*files}):
         with reading(file), file.open("rb") as content:
             digests[file] = hashlib.file_digest(content, "sha256").digest()
     return digests

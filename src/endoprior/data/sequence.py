@@ -321,7 +321,7 @@ class FrameSequence:
 
     def fingerprints(self) -> Fingerprints:
         """That of all files, and that of the images of its frames."""
-        digests = digests_of({*self.files})
+        digests = digests_of(self.files)
         images = {file: digests[file] for file in self.image_files}
         return Fingerprints(fingerprint_of(digests, self.path), fingerprint_of(images, self.path) if images else "")
 

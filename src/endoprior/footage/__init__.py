@@ -1,1 +1,1 @@
-"""Image analysis of a clip, as pure functions: borders, labels, motion, changes, stereo order, masks, depth unit."""
+"""Image analysis of a clip, as pure functions: borders, labels, motion, changes, stereo matching, masks, depth unit."""

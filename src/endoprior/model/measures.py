@@ -235,12 +235,9 @@ class SurfaceMotion:
     def __init__(self, scene: Scene, since: int, min_alpha: float = 0.5) -> None:
         """Render the surface of frame `since`, and sample it on a grid."""
         self._scene, self.since = scene, since
-        surface = render_surface(scene, self._time(since), scene.cameras[since], min_alpha)
+        surface = render_surface(scene, self._scene.frame_time(since), scene.cameras[since], min_alpha)
         self.samples = surface_samples(surface.depth, surface.camera)
         """(S, 3) points of the surface in that frame, world axes, mm."""
-
-    def _time(self, frame: int) -> float:
-        return frame / len(self._scene.cameras)
 
     def stretch(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
         """(F, P) largest principal stretch of `strain`."""
@@ -253,7 +250,7 @@ class SurfaceMotion:
         """
 
         def carried(samples: NDArray) -> NDArray:
-            times = [self._time(frame) for frame in (self.since, *frames)]
+            times = [self._scene.frame_time(frame) for frame in (self.since, *frames)]
             return carry_points(self._scene, samples, np.zeros(len(samples), np.intp), times)[1:]
 
         return strain_around(points, self.samples, len(frames), carried)

@@ -33,14 +33,14 @@ class Playback:
     def _parts(self, index: int) -> list[tuple[Splats, float]]:
         if not 0 <= index < len(self):
             raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
-        return self._cache.get(index, lambda: self.scene.parts_at(index / len(self)))
+        return self._cache.get(index, lambda: self.scene.parts_at(self.scene.frame_time(index)))
 
     @torch.no_grad()
     def render(self, index: int, camera: Camera | None = None) -> RenderedView:
         """Render frame `index`, from `camera` or else from its own. See `Scene.render`."""
         scene = self.scene
         if camera is not None and scene.config.data.eyes == "both":  # colors differ from camera to camera
-            return scene.render(index / len(self), camera)
+            return scene.render(self.scene.frame_time(index), camera)
         return render_parts(self._parts(index), camera or scene.cameras[index], scene.backend, scene.background)
 
     @torch.no_grad()

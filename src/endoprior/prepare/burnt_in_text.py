@@ -1,6 +1,6 @@
 """Burnt-in text of a clip: where it is in each frame, painted black there, and masked.
 
-Samples are searched first. Text that rests is taken to be in all frames from the sample before the first one that shows
+Samples are searched first. Static text is taken to be in all frames from the sample before the first one that shows
 it to the sample after the last one; only for text that moves are the frames searched. Text that moves and is in fewer
 than three samples is missed.
 """

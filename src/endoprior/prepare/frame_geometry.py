@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.ranges import evenly_spaced
-from ..footage.border import Circle, Strips
+from ..footage.border import Strips
+from ..footage.round_border import Circle
 from ..footage.stereo_matching import row_offsets_px
 from .calibration import Calibration, Intrinsics, Size, check_pair
 from .config import Rectangle

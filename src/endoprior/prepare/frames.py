@@ -23,7 +23,6 @@ from ..data.found_tools import FrameRow, found_source, write_rows
 from ..data.frame_files import match_files
 from ..data.images import (
     DEPTH_SUFFIXES,
-    TOOL_VALUE,
     read_color,
     read_depth_file,
     read_stored,
@@ -353,7 +352,7 @@ def replace_by_carried(
     for i in range(files.count):
         rgb_u8 = read_color(files.file("images", i))
         mask = store.mask(i) | ~inside | methods.hidden(used[i], rgb_u8)
-        write_tool_mask(files.file("masks", i), mask, TOOL_VALUE)
+        write_tool_mask(files.file("masks", i), mask)
         if methods.shade is not None:
             depth = np.where(inside, methods.shade(rgb_u8, ~mask), np.float32(0))
             save_png(files.file("depth", i), files.depth_units(depth))

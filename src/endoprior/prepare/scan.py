@@ -47,7 +47,7 @@ class ScannedFrame:
 
     seconds: float  # since the first image
     quality: FrameQuality
-    link: GlobalMotion | None  # motion of the image as a whole since an image before; None: unknown
+    motion: GlobalMotion | None  # of the image as a whole since an image before; None: unknown
     word: str = ""  # what is wrong with it; empty for nothing
     weight: float = 1.0  # how far it is to be believed, in [0, 1]
 
@@ -100,8 +100,8 @@ def scan_video(
         small = image(*size)
         frozen.append(np.inf if before is None else float(cv2.absdiff(small, before).mean()))
         before = small
-        link = watch.link(np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8))
-        frames.append(ScannedFrame(seconds, measure_quality(small, inside), link))
+        motion = watch.motion(np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8))
+        frames.append(ScannedFrame(seconds, measure_quality(small, inside), motion))
         progress(seconds, source.seconds)
     sudden = np.zeros(len(frames) + 1, bool)
     first_after = np.full(len(frames) + 1, np.inf)
@@ -160,7 +160,7 @@ class _Watch:
         self._inside, self._count = inside, 0
         self._views = deque[ImageFeatures](maxlen=max(int(BACK_S * rate), 1))
 
-    def link(self, gray: NDArray[np.uint8]) -> GlobalMotion | None:
+    def motion(self, gray: NDArray[np.uint8]) -> GlobalMotion | None:
         """How the tissue moved since an earlier image."""
         now, found = ImageFeatures(gray, self._inside), None
         for back in (each for each in BACK if each <= len(self._views)):

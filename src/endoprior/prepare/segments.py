@@ -105,7 +105,7 @@ def _not_usable(words: list[str], edges: list[float]) -> list[Stretch]:
 def _segment(frames: list[ScannedFrame], edges: list[float]) -> Stretch:
     """A segment with its score and its best part."""
     lasts = np.diff(edges)
-    known = np.array([frame.link is not None for frame in frames])
+    known = np.array([frame.motion is not None for frame in frames])
     known[:1] = True  # the first image follows nothing
     worth = np.concatenate(
         [[0.0], np.cumsum(lasts * [frame.weight for frame in frames] * np.where(known, 1, UNKNOWN_MOTION))]
@@ -142,8 +142,8 @@ def as_json(scan: Scan) -> dict[str, Any]:
             "seconds": [round(frame.seconds, 3) for frame in scan.frames],
             "problem": [frame.word for frame in scan.frames],
             "weight": [round(frame.weight, 3) for frame in scan.frames],
-            "shift": [None if frame.link is None else round(frame.link.shift, 4) for frame in scan.frames],
-            "residual": [None if frame.link is None else round(frame.link.residual, 5) for frame in scan.frames],
+            "shift": [None if frame.motion is None else round(frame.motion.shift, 4) for frame in scan.frames],
+            "residual": [None if frame.motion is None else round(frame.motion.residual, 5) for frame in scan.frames],
             **{
                 name: [round(frame.quality[k], 4) for frame in scan.frames]
                 for k, name in enumerate(scan.frames[0].quality._fields if scan.frames else ())

@@ -109,7 +109,7 @@ class ViewableScene:
             value, known, _ = np.moveaxis(color, -1, 0)
             return colorize(value / np.maximum(known, 1e-6), 0, 1, known > SOLID_ALPHA)
         if settings.smoke and settings.endoscope:
-            view = behind_smoke(out.view, self.scene.smoke_at(settings.frame / len(self.cameras)))
+            view = behind_smoke(out.view, self.scene.smoke_at(self.scene.frame_time(settings.frame)))
             color = view.color.cpu().numpy()
         return to_uint8(color)
 
@@ -142,7 +142,7 @@ class ViewableScene:
 
     def _values(self, settings: ViewSettings) -> Tensor:
         """(N,) value of the layer for each Gaussian, as a share of the color scale, in [0, 1]; NaN where unknown."""
-        time, low, high = settings.frame / len(self.cameras), 0.0, 1.0
+        time, low, high = self.scene.frame_time(settings.frame), 0.0, 1.0
         if settings.layer == "prior":
             return torch.cat([shown.window.scene.prior_score for shown in self.scene.shown_at(time)]).clamp(0, 1)
         if settings.layer == "support":

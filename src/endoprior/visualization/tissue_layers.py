@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .. import render
 from ..core.geometry import pixel_centers, project
-from ..core.types import Camera, Frame, Splats, to_uint8
+from ..core.types import Camera, Frame, Splats, frame_times, to_uint8
 from ..model.carry import centers_then
 from ..model.colors import with_fixed_color
 from ..model.gaussians import with_colors
@@ -58,8 +58,8 @@ class PaintedTissue:
 
     def __init__(self, scene: Scene, time: float = 0.0) -> None:
         """Paint what the camera sees at `time` in [0, 1]."""
-        num, camera = len(scene.cameras), scene.camera_at(time)
-        self._scene = with_fixed_color(scene, [i / num for i in range(num)])
+        camera = scene.camera_at(time)
+        self._scene = with_fixed_color(scene, frame_times(len(scene.cameras)))
         self._painted_at, self._surface = time, render_surface(scene, time, camera)
         self._square = camera.width / SQUARES
 

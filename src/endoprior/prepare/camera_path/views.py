@@ -43,7 +43,7 @@ class HighPassImage:
 
     @classmethod
     def of(cls, rgb_u8: NDArray[np.uint8], tissue_mask: NDArray[np.bool_], size: tuple[int, int]) -> HighPassImage:
-        """The view of a frame (H, W, 3) with its tissue (H, W), at `size` (w, h)."""
+        """That of a frame (H, W, 3) with its tissue (H, W), at `size` (w, h)."""
         counts = tissue_mask & (specular_likelihood(rgb_u8 * np.float32(1 / 255)) < HIGHLIGHT)
         share = cv2.resize(counts.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         usable = (share > USABLE).astype(np.float32)
@@ -55,7 +55,7 @@ class HighPassImage:
         return cls(np.asarray(detail, np.float32), usable)
 
     def resized(self, size: tuple[int, int]) -> HighPassImage:
-        """The view at a smaller size (w, h)."""
+        """The same at a smaller size (w, h)."""
         usable = cv2.resize(self.usable, size, interpolation=cv2.INTER_AREA)
         detail = cv2.resize(self.detail, size, interpolation=cv2.INTER_AREA)
         return HighPassImage(np.asarray(detail, np.float32), (usable > USABLE).astype(np.float32))
