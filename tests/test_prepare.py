@@ -202,7 +202,7 @@ def test_frames_outside_the_body_can_be_dropped(tmp_path, phantom):
     video = write_video(tmp_path / "v.mkv", images)
     kept = prepare(video, tmp_path / "kept", PrepareConfig(layout="mono"))
     assert json.loads((kept.out / "sequence.json").read_text())["unexplained_frames"] == [2]
-    assert any("no camera pose" in note and "frames 2;" in note for note in kept.notes)
+    assert any("no camera pose" in note and "frame 2;" in note for note in kept.notes)
     dropped = prepare(video, tmp_path / "dropped", PrepareConfig(layout="mono", drop_out_of_body=True))
     assert dropped.num_frames == FRAMES
 
